@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from teacher_server import TeacherServer
 
-from caption.answer_formats.contract import Draft
-from caption.answer_formats.formats import FORMATS
+from caption.answer_formats.formats import FORMATS, Draft
 from caption.schema import CaptionConfig
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.rules import write_templates

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from commands import invoke
 
-from caption.answer_formats.contract import Draft
-from caption.answer_formats.formats import FORMATS
+from caption.answer_formats.formats import FORMATS, Draft
 from caption.schema import CaptionConfig, ObservedWindow, observed_frames
 from caption.stage.stage import run
 from caption.teachers.prompt_files import (

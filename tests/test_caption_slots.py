@@ -15,8 +15,7 @@ from specimens_captions import GAP, SLOTS, report_of, saying, settings
 from tables import each
 from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror
 
-from caption.answer_formats.contract import Draft, Refused
-from caption.answer_formats.formats import Filler, fact_table
+from caption.answer_formats.formats import Draft, Filler, Refused, fact_table
 from caption.answer_formats.templates import InvalidSlot, read_sentence
 from caption.schema import WindowConfig
 from caption.stage.stage import run

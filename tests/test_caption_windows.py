@@ -14,8 +14,8 @@ from teacher_server import TeacherServer
 from caption.schema import CaptionConfig, FutureMotion, ImageConfig, ObservedWindow, WindowConfig, observed_frames
 from caption.stage.stage import run
 from caption.stage.windows import current_frames, cut_future, cut_windows, recorded_motion
-from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import make_question, question_messages
+from caption.teachers.teacher import FrameEncoder
 from caption.verification.actions import TABLE, measure
 from caption.verification.facts import measure_facts
 from cosfly.formats.boxes import MapHeader, make_box_map

@@ -15,9 +15,8 @@ from tables import each
 from caption.schema import CaptionConfig, ImageConfig, Window, WindowConfig
 from caption.stage.window_loop import caption_window
 from caption.stage.windows import cut_windows
-from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import make_question, question_messages
-from caption.teachers.teacher import RuleTeacher
+from caption.teachers.teacher import FrameEncoder, RuleTeacher
 from cosfly.formats.captions import PICTURES_MARK, Language
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks

@@ -11,18 +11,56 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
-from caption.answer_formats.contract import Draft, Refused
 from caption.answer_formats.templates import InvalidSlot, Sentence, Slot, read_sentence, read_slot
 from caption.verification.facts import Facts
 from caption.verification.glossary import form_of, swapped_opposite, written_unit
 from caption.verification.mirror import TEXTS, check_mirror, check_translation, lacking
 from caption.verification.references import QUANTITIES, TURNS, Fact, Missing, look_up
-from cosfly.formats.captions import ACTIONS, Coc, Language, Template, Writing
+from cosfly.formats.captions import ACTIONS, TOKENS, Coc, Language, Template, Writing
 from cosfly.llm.answer_text import cut_sentences, sentences_of
 
 INVALID_SLOT = "invalid_slot"  # a reason
 MAX_COMPLAINTS = 6  # named at once
+# Asked for between the texts and the decision. It is free even where the decision is given.
+THEREFORE = {"therefore": {"type": "string", "enum": list(TOKENS)}}
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A caption in one language.
+
+    Args:
+        coc: its plain text. therefore: the decision to which the reasoning leads, of the English alone.
+        template: what the text was filled from. outside: the sentences without their slots.
+        num_filled: slots that were filled with a value.
+    """
+
+    coc: Coc
+    outside: tuple[str, ...]
+    template: Template | None = None
+    num_filled: int = 0
+    therefore: str | None = None
+
+    @property
+    def written(self) -> dict[str, Any]:
+        """The answer as the teacher wrote it: the template where there is one."""
+        return self.coc.model_dump() | (self.template.model_dump() if self.template else {})
+
+
+@dataclass(frozen=True)
+class Refused:
+    """An answer of the right structure that is not taken.
+
+    Args:
+        reason: a code that is counted. complaint: the fault and what is allowed, for the teacher. draft: what could be
+            read of the answer.
+    """
+
+    reason: str
+    complaint: str
+    draft: Draft | None = None
 
 
 def fill_answer(written: Coc, facts: Facts, language: Language = "en") -> Draft | Refused:

@@ -12,8 +12,7 @@ from dataclasses import replace
 import numpy as np
 from pydantic import ValidationError
 
-from caption.answer_formats.contract import Refused
-from caption.answer_formats.formats import FORMATS, fill_answer
+from caption.answer_formats.formats import FORMATS, Refused, fill_answer
 from caption.schema import FutureMotion, ObservedFrame
 from caption.stage.windows import LabelMotion, cut_future, frames_of, label_motion, observe
 from caption.verification.actions import TABLE, ActionTable, Motion, Thresholds, measure

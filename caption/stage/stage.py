@@ -10,14 +10,13 @@ import asyncio
 import logging
 import shutil
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 
 from caption.schema import CaptionConfig, Window
 from caption.stage.asking import ANSWERS, Asking, AskingOutcome, common_causes, read_quarantine
 from caption.stage.ledger import CaptionReport, SampleCards, explain_drops, page_html
 from caption.stage.tracks import PARTS, TrackInput, find_inputs, parts_of, restore_parts
-from caption.stage.window_loop import caption_prepared, prepare
+from caption.stage.window_loop import caption_window
 from caption.teachers.foreign import read_given
 from caption.teachers.prompt_files import PROMPTS, Vocabulary, keep_own_prompts, vocabulary_of
 from caption.teachers.students import student_settings
@@ -39,7 +38,6 @@ log = logging.getLogger(__name__)
 
 PRODUCT, REPORT, PAGE = "captions.jsonl", "caption_report.json", "report.html"
 PACKAGE_FILES = {"glossary": GLOSSARY_FILE}  # a directory never mixes captions of two glossaries or two prompts
-WINDOWS_AT_ONCE = 128  # prepared together for an embedded teacher
 
 
 def run(
@@ -217,10 +215,9 @@ def make_worker(cfg: CaptionConfig, vocabulary: Vocabulary, stage_path: Path, se
     async def caption_in_order(windows: Iterator[Window]) -> list[bytes]:
         """Return the lines of captions; a line takes far less time in garbage collection than a caption."""
         lines: list[bytes] = []
-        while batch := list(islice(windows, WINDOWS_AT_ONCE)):
-            for prepared in prepare(batch, teacher, cfg, vocabulary):
-                lines.append(line_of(await caption_prepared(prepared, teacher, cfg)))
-                advance()
+        for window in windows:
+            lines.append(line_of(await caption_window(window, teacher, cfg, vocabulary)))
+            advance()
         return lines
 
     def work(item: Item) -> Outcome:

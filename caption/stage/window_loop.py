@@ -6,14 +6,11 @@ that the trajectory contradicts is asked for again, by default anchored to the l
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
-from caption.answer_formats.contract import Draft, Refused
+from caption.answer_formats.formats import Draft, Refused
 from caption.schema import CaptionConfig, Strategy, Window
 from caption.stage.ledger import REASONS
-from caption.teachers.foreign import Terms
 from caption.teachers.judge import Conflict, Judge
 from caption.teachers.prompt_files import Vocabulary
 from caption.teachers.prompts import Correction, Question, make_question, prompt_hash
@@ -46,32 +43,6 @@ MOST_REFUSAL_TEXT = 300  # characters of a refusal in the record
 CONTRADICTED = "contradicted_value"
 
 
-class PreparedWindow(NamedTuple):
-    """A window, its question, and the measurements that verify the answer."""
-
-    window: Window
-    terms: Terms
-    question: Question
-    prompt_hash: str
-    label: str | None
-    contradicted: list[str]
-
-
-def prepare(
-    windows: Sequence[Window], teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary
-) -> list[PreparedWindow]:
-    """Measure windows and write their questions: step by step for all, so that the code stays in the CPU's caches."""
-    terms = [teacher.terms(window.observed.sample_id) for window in windows]
-    questions = [
-        make_question(w.observed, cfg.image, t.writing, vocabulary) for w, t in zip(windows, terms, strict=True)
-    ]
-    hashes = [prompt_hash(question) for question in questions]
-    motions = [measure(window.future) for window in windows]
-    labels = [TABLE.label_of(motion) for motion in motions]
-    contradicted = [TABLE.contradicted_by(m, label) for m, label in zip(motions, labels, strict=True)]
-    return list(map(PreparedWindow, windows, terms, questions, hashes, labels, contradicted))
-
-
 async def caption_window(
     window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary, judge: Judge | None = None
 ) -> Caption:
@@ -80,19 +51,11 @@ async def caption_window(
     Raises:
         NoAnswer: The teacher gave none, but may later. TeacherError: No window will get an answer.
     """
-    [prepared] = prepare([window], teacher, cfg, vocabulary)
-    return await caption_prepared(prepared, teacher, cfg, judge)
-
-
-async def caption_prepared(
-    prepared: PreparedWindow, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None
-) -> Caption:
-    """Make the caption of a prepared window; raises like `caption_window`."""
-    loop = _WindowLoop(teacher, cfg, prepared, judge)
-    reason = prepared.window.problem
+    loop = _WindowLoop(window, teacher, cfg, vocabulary, judge)
+    reason = window.problem
     if reason is None:
         try:
-            reason = await loop.run(prepared.question)
+            reason = await loop.run()
         except NoAnswer as error:
             if not error.is_final:
                 raise
@@ -122,14 +85,13 @@ async def try_strategy(
 ) -> Trial | None:
     """Repair the first answer of a window by a strategy; None if it is not rejected. NoAnswer: There is none."""
     repair = cfg.repair.model_copy(update={"strategy": strategy})
-    [prepared] = prepare([window], teacher, cfg, vocabulary)
-    loop = _WindowLoop(teacher, cfg.model_copy(update={"repair": repair}), prepared)
-    reason = await loop.ask_freely(prepared.question)
-    if reason is not None or repair.treatment_of(loop.caption.verdict) == "keep" or prepared.label is None:
+    loop = _WindowLoop(window, teacher, cfg.model_copy(update={"repair": repair}), vocabulary)
+    reason = await loop.ask_freely(loop.answered)
+    if reason is not None or repair.treatment_of(loop.caption.verdict) == "keep" or loop.label is None:
         return None
     first, num_asks, tokens = loop.english.coc, loop.caption.attempts, loop.caption.usage.total
     try:
-        reason = await loop.regenerate(prepared.question)
+        reason = await loop.regenerate(loop.answered)
     except NoAnswer as error:  # a teacher without a reason for the label has not repaired the conflict
         if not error.is_final:
             raise
@@ -142,14 +104,23 @@ class _WindowLoop:
     """The asks of one window and their results.
 
     caption: Its record so far. drafts: The answers that were accepted; a Chinese one may have been refused.
-    answered: The question that the English one answers.
+    answered: The question that the English one answers; at first the free one.
     """
 
     def __init__(
-        self, teacher: Teacher, cfg: CaptionConfig, prepared: PreparedWindow, judge: Judge | None = None
+        self,
+        window: Window,
+        teacher: Teacher,
+        cfg: CaptionConfig,
+        vocabulary: Vocabulary,
+        judge: Judge | None = None,
     ) -> None:
         self.teacher, self.cfg, self.judge = teacher, cfg, judge
-        window, self.terms, self.answered, prompt_hash, self.label, self.contradicted = prepared
+        self.terms = teacher.terms(window.observed.sample_id)
+        self.answered = make_question(window.observed, cfg.image, self.terms.writing, vocabulary)
+        motion = measure(window.future)
+        self.label = TABLE.label_of(motion)
+        self.contradicted = TABLE.contradicted_by(motion, self.label)
         asks = (1, 0, 1) if self.terms.is_fixed else (STRUCTURE_ASKS, CORRECTION_ASKS, MIRROR_ASKS)
         self.structure_asks, self.correction_asks, self.mirror_asks = asks
         self.format = self.answered.format
@@ -167,8 +138,8 @@ class _WindowLoop:
             frame_index=observed.indices[-1],
             window=list(observed.indices),
             future=list(window.future.indices),
-            prompt={"en": self.answered.prompts["en"], "zh": self.answered.prompts["zh"]},
-            prompt_hash=prompt_hash,
+            prompt=self.answered.prompts,
+            prompt_hash=prompt_hash(self.answered),
             picture_px=pictures.size_px,
             depth_range_m=pictures.depth_range_m if "depth" in pictures.views else None,
             teacher=teacher.record,
@@ -197,9 +168,10 @@ class _WindowLoop:
         caption.status, caption.drop_reason = "accepted" if reason is None else "dropped", reason
         return caption
 
-    async def run(self, question: Question) -> str | None:
+    async def run(self) -> str | None:
         """Ask, verify, regenerate and translate; return the reason to drop the window, None to accept it."""
-        reason, checks = await self._attempt(question), self.checks
+        question, checks = self.answered, self.checks
+        reason = await self._attempt(question)
         if reason == CONTRADICTED and self.correction_asks:  # once more, with the measured values
             self._refused.append(reason)
             problems = (checks.contradictions or [])[:MAX_COMPLAINTS]

@@ -16,7 +16,7 @@ from typing import Literal
 import httpx
 import numpy as np
 
-from caption.answer_formats.contract import THEREFORE
+from caption.answer_formats.formats import THEREFORE
 from caption.schema import CaptionConfig, ObservedFrame, ObservedWindow
 from caption.teachers.prompt_files import Vocabulary
 from caption.teachers.prompts import MAX_RETURNED_CHARACTERS, Correction, make_question, question_messages

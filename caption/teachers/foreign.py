@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from caption.answer_formats.contract import Draft
+from caption.answer_formats.formats import Draft
 from caption.schema import CaptionConfig
 from caption.teachers.prompts import Question
 from cosfly.formats.captions import Coc, Language, TeacherRecord, TeacherSettings, Writing

@@ -5,14 +5,13 @@ Nothing here reads the future. Every caption records the hash of its question.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
-from caption.answer_formats.contract import Draft
-from caption.answer_formats.formats import FORMATS, AnswerFormat
+from caption.answer_formats.formats import FORMATS, AnswerFormat, Draft
 from caption.schema import ImageConfig, ObservedWindow
-from caption.teachers.images import EncodeFrame, pictures_of
 from caption.teachers.prompt_files import Vocabulary, prompt_format
 from caption.verification.facts import Facts, measure_facts
 from caption.verification.glossary import LANGUAGES, form_of, prompt_line, translations, written_unit
@@ -21,9 +20,10 @@ from cosfly.formats.captions import ACTIONS, GOAL_WORDS, PICTURES_MARK, TOKENS, 
 from cosfly.llm.student_chat import EncodedImage, chat_messages
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import dump_json
-from cosfly.viz.frame_views import Pictures
+from cosfly.viz.frame_views import VIEW_FILES, Pictures, scaled_size
 
 MAX_RETURNED_CHARACTERS = 6000  # of a refused answer that is returned to its teacher
+EncodeFrame = Callable[[Path, Pictures], list[EncodedImage]]  # the pictures of a frame, by its folder
 
 
 @dataclass(frozen=True)
@@ -254,6 +254,17 @@ def mirror_messages(question: Question, english: Draft, complaint: str | None = 
         system += "\n" + templates["correction_en"].substitute(complaint=complaint)
     user = templates["mirror_user"].substitute(english=dump_json(english.written))
     return [{"role": "system", "content": system}, {"role": "user", "content": user}]
+
+
+def pictures_of(window: ObservedWindow, cfg: ImageConfig) -> Pictures:
+    """Return which pictures of a window are sent: the wanted views that every observed frame has.
+
+    Public trees can lack depth. Without any view, pixels are the camera's; if none is wanted, those of the settings.
+    """
+    in_all = frozenset.intersection(*window.frame_files)
+    views = tuple([view for view in cfg.modalities if VIEW_FILES[view] in in_all])
+    size_px = scaled_size(window.width_px, window.height_px, cfg.max_side_px if views or not cfg.modalities else None)
+    return Pictures(views, size_px, cfg.layout, cfg.depth_range_m)
 
 
 def make_question(window: ObservedWindow, image: ImageConfig, writing: Writing, vocabulary: Vocabulary) -> Question:

@@ -13,9 +13,8 @@ from pathlib import Path
 
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import Terms
-from caption.teachers.images import EncodeFrame
 from caption.teachers.prompt_files import Vocabulary
-from caption.teachers.prompts import Question, encode_frames, regeneration_lines, system_prompt
+from caption.teachers.prompts import EncodeFrame, Question, encode_frames, regeneration_lines, system_prompt
 from cosfly.formats.captions import Language
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.contract import Request

@@ -8,20 +8,21 @@ Chinese of an English answer; its complaint says what was wrong with the last on
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
+import threading
+from collections import Counter, OrderedDict
 from collections.abc import AsyncIterator, Callable
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 from pydantic_core import to_json
 
-from caption.answer_formats.contract import THEREFORE, Draft
+from caption.answer_formats.formats import THEREFORE, Draft
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import GivenTeacher, Terms
-from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import Question, mirror_messages, question_messages
 from caption.teachers.rules import MODEL, write_templates
 from caption.teachers.students import TrainedStudent
@@ -31,12 +32,14 @@ from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.answers import BYTES_PER_TOKEN, PIXELS_PER_TOKEN, AnswerBook, Budget, KeptAnswers
 from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Engine, NoAnswer, Reply, Request, Troubles, started
-from cosfly.llm.student_chat import encoded_image
+from cosfly.llm.student_chat import EncodedImage, encoded_image
 from cosfly.llm.vllm_engine import VllmEngine
 from cosfly.runtime.limits import num_cpus
 from cosfly.runtime.seeding import random_bytes, rng_for
+from cosfly.viz.frame_views import Pictures
 
 ENCODING_THREADS = 4
+CACHE_FRAMES = 256  # encoded frames in memory, for the windows that share them
 Result = TypeVar("Result")
 EMBEDDED = ("rules", "file", "student")  # kinds of teacher that answer at once, in the process
 
@@ -74,6 +77,31 @@ class RuleTeacher:
 
 def _native(answer: dict[str, str]) -> Reply:
     return Reply(to_json(answer).decode(), None, "native", "stop")  # a tenth of the time of the json module
+
+
+class FrameEncoder:
+    """Reads and encodes frames on any thread, each once; keeps the last CACHE_FRAMES of them."""
+
+    def __init__(self, encode: Callable[[np.ndarray], EncodedImage]) -> None:
+        self._encode = encode
+        self._cache: OrderedDict[tuple[Path, Pictures], Future[list[EncodedImage]]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def encode(self, frame: Path, pictures: Pictures) -> list[EncodedImage]:
+        """Return the pictures of one frame, one per view or a tiled one; InputError if a file cannot be read."""
+        key = (frame, pictures)
+        with self._lock:
+            is_new = key not in self._cache
+            future = self._cache.setdefault(key, Future())
+            self._cache.move_to_end(key)
+            if len(self._cache) > CACHE_FRAMES:
+                self._cache.popitem(last=False)
+        if is_new:  # other threads wait for it
+            try:
+                future.set_result([self._encode(picture) for picture in pictures.read(frame)])
+            except Exception as error:
+                future.set_exception(error)
+        return future.result()
 
 
 class AskingTeacher:

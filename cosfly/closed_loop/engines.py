@@ -18,7 +18,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from caption.answer_formats.contract import THEREFORE, Draft
+from caption.answer_formats.formats import THEREFORE, Draft
 from caption.schema import CaptionConfig, ObservedWindow, observed_frames
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.prompts import Question, make_question

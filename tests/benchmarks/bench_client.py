@@ -31,8 +31,7 @@ from caption.schema import CaptionConfig
 from caption.stage.asking import Asking
 from caption.stage.stage import open_stage
 from caption.stage.tracks import find_inputs
-from caption.teachers.images import FrameEncoder
-from caption.teachers.teacher import AskingTeacher
+from caption.teachers.teacher import AskingTeacher, FrameEncoder
 from cosfly.formats.frames import SKY_DEPTH_M
 from cosfly.llm import protocol
 from cosfly.viz.frame_views import VIEW_FILES
