@@ -15,7 +15,7 @@ from pathlib import Path
 from caption.schema import CaptionConfig, Window
 from caption.stage.asking import ANSWERS, Asking, AskingOutcome, common_causes, read_quarantine
 from caption.stage.ledger import CaptionReport, SampleCards, explain_drops, page_html
-from caption.stage.tracks import PARTS, TrackInput, find_inputs, parts_of, restore_parts
+from caption.stage.tracks import PARTS, TrackInput, find_inputs, parts_of
 from caption.stage.window_loop import caption_window
 from caption.teachers.foreign import read_given
 from caption.teachers.prompt_files import PROMPTS, Vocabulary, keep_own_prompts, vocabulary_of
@@ -71,12 +71,10 @@ def run(
     unused = set[str]() if cfg.caption_file is None else {sample_id for sample_id, _ in read_given(cfg)}
     stage = open_stage(cfg, data, out, seed, resume)
     if stage.is_complete and not _has_more(stage, cfg, retry_failed):
-        if read_manifest(out).facts.get("limit") is None:
-            shutil.rmtree(out / PARTS, ignore_errors=True)  # the process was killed before it removed them
+        _remove_parts(stage)  # the process may have been killed before it removed them
         return out / PRODUCT
     tracks, is_cut = find_inputs(cfg, data)
-    if stage.is_complete:  # otherwise the product may hold a share of a track
-        restore_parts(stage.path, out / PRODUCT, tracks)
+    if stage.is_complete:
         stage.reopen()
     if cfg.teacher_kind in EMBEDDED and cfg.judge.url is None:
         items = [Item(track.item_id, track) for track in tracks]
@@ -154,8 +152,13 @@ def _finish(
     outputs = [out / PRODUCT, out / REPORT, out / PAGE, *sorted((out / ANSWERS).glob("*.jsonl"))]
     outputs += keep_own_prompts(out, vocabulary)
     stage.finish(outputs, tally, flights=outcome.tracks.model_dump(), limit=cfg.limit if is_cut else None)
-    if not is_cut:
-        shutil.rmtree(out / PARTS, ignore_errors=True)  # a cut run keeps them, for the next with a larger limit
+    _remove_parts(stage)
+
+
+def _remove_parts(stage: StageFolder) -> None:
+    """Remove the part files of a complete stage that no later run continues, for a larger limit or a refused window."""
+    if read_manifest(stage.path).facts.get("limit") is None and not read_quarantine(stage.path):
+        shutil.rmtree(stage.path / PARTS, ignore_errors=True)
 
 
 def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Resume) -> StageFolder:

@@ -1,7 +1,8 @@
 """The tracks of a run: their names, their share of a limit, their windows, and their part files.
 
 A finished track is a part file `parts/<name>.jsonl`. A track that a limit cuts is `parts/<name>.<windows>.cut`, which
-does not count as finished under another limit; one with an unanswered window is `parts/<name>.gap`.
+does not count as finished under another limit; one with an unanswered window is `parts/<name>.gap`. The folder is
+removed when nothing can be added to the product.
 """
 
 from __future__ import annotations
@@ -9,13 +10,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby, islice
+from itertools import islice
 from pathlib import Path
 
 from caption.schema import CaptionConfig, Window, WindowConfig
 from caption.stage.windows import current_frames, cut_windows
-from cosfly.formats.captions import caption_lines, write_caption_lines
-from cosfly.formats.places import flight_ids, flight_of, place_of
+from cosfly.formats.places import flight_ids, place_of
 from cosfly.formats.playback import Track, read_track
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.runtime.errors import InputError, VerifyError
@@ -99,17 +99,3 @@ def parts_of(stage_path: Path, tracks: Sequence[TrackInput], with_gaps: bool) ->
         paths = [track.part(stage_path), track.gap(stage_path)] if with_gaps else [track.part(stage_path)]
         found += [path for path in paths if path.exists()][:1]
     return found
-
-
-def restore_parts(stage_path: Path, product: Path, tracks: Sequence[TrackInput]) -> None:
-    """Cut the product of a finished stage into its parts again, so that a run that resumes keeps its captions.
-
-    A track with any part is skipped: under a limit, the product may hold only a share of it.
-    """
-    begun = {path.name.removesuffix(".cut").rsplit(".", 1)[0] for path in (stage_path / PARTS).glob("*")}
-    lost = {track.name: track for track in tracks if track.max_windows is None and track.name not in begun}
-    if not lost or not product.exists():
-        return
-    for name, captions in groupby(caption_lines(product), key=lambda pair: flight_of(pair[1].sample_id)):
-        if name in lost:
-            write_caption_lines(lost[name].part(stage_path), (line.encode() for line, _ in captions))
