@@ -68,7 +68,7 @@ def run(
         raise ConfigError(what, where="--retry-failed", got=cfg.teacher_kind, fix=fix)
     vocabulary = vocabulary_of(cfg)
     cfg = student_settings(cfg, vocabulary)
-    unused = set[str]() if cfg.caption_file is None else {sample_id for sample_id, _ in read_given(cfg)}
+    unused = set[str]() if cfg.caption_file is None else {sample_id for sample_id, _ in read_given(cfg)[0]}
     stage = open_stage(cfg, data, out, seed, resume)
     if stage.is_complete and not _has_more(stage, cfg, retry_failed):
         _remove_parts(stage)  # the process may have been killed before it removed them

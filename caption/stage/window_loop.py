@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from caption.answer_formats.formats import Draft, Refused
+from caption.answer_formats.formats import THEREFORE, Draft, Refused
 from caption.schema import CaptionConfig, Strategy, Window
 from caption.stage.ledger import REASONS
 from caption.teachers.judge import Conflict, Judge
@@ -121,7 +121,9 @@ class _WindowLoop:
         motion = measure(window.future)
         self.label = TABLE.label_of(motion)
         self.contradicted = TABLE.contradicted_by(motion, self.label)
-        asks = (1, 0, 1) if self.terms.is_fixed else (STRUCTURE_ASKS, CORRECTION_ASKS, MIRROR_ASKS)
+        is_fixed = self.terms.is_fixed
+        self.fields = () if is_fixed else tuple(THEREFORE)  # of an English answer, beyond the paper's three
+        asks = (1, 0, 1) if is_fixed else (STRUCTURE_ASKS, CORRECTION_ASKS, MIRROR_ASKS)
         self.structure_asks, self.correction_asks, self.mirror_asks = asks
         self.format = self.answered.format
         self.drafts: dict[Language, Draft] = {}
@@ -231,7 +233,7 @@ class _WindowLoop:
         if parsed.coc is None:
             return Refused(parsed.reason or "", "")
         decision, therefore = parsed.coc.flight_decision, parsed.therefore
-        if "therefore" in self.terms.fields and decision != therefore:
+        if self.fields and decision != therefore:
             complaint = (
                 f'"therefore" says {therefore} and "flight_decision" says {decision}: both name the one action that '
                 "your reasoning leads to. Let the reasoning lead to the decision."
@@ -245,7 +247,7 @@ class _WindowLoop:
         self.caption.attempts += 1
         self.caption.usage += usage
         self._structured = reply.structured
-        fields = self.terms.fields if language == "en" else ()
+        fields = self.fields if language == "en" else ()
         parsed = parse_answer(reply.text, language, fields, reply.finish_reason)
         self.checks.refusal = None  # of an earlier answer
         if parsed.reason == DECLINED:

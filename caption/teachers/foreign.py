@@ -1,14 +1,13 @@
 """Given answers instead of a model: captions written elsewhere (`file:PATH`), or predictions of a student (`student:PATH`).
 
-A file has one line per window: sample_id, en {three fields} and, if the writer has them, zh {three fields}, therefore.
-Predictions are `predictions.jsonl`. No answer can be asked for again; a window without one is dropped.
+A file has one line per window: sample_id, en {three fields} and, if the writer has it, zh {three fields}. Predictions
+are `predictions.jsonl`. No answer can be asked for again; a window without one is dropped.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from caption.answer_formats.formats import Draft
 from caption.schema import CaptionConfig
@@ -28,7 +27,6 @@ class ForeignCaption(Record):
     sample_id: str
     en: Coc
     zh: Coc | None = None
-    therefore: str | None = None
 
 
 @dataclass(frozen=True)
@@ -36,36 +34,26 @@ class Terms:
     """How a teacher answers for a window.
 
     Args:
-        fields: Fields of the answer beyond the paper's three.
         is_given: It cannot be asked for again.
-        is_fixed: Asked once more or corrected, it gives the same answer, and its Chinese is no translation.
+        is_fixed: Asked once more or corrected, it gives the same answer, it has the paper's three fields alone, and its
+            Chinese is no translation.
     """
 
     writing: Writing
-    fields: tuple[str, ...] = ()
     is_given: bool = False
     is_fixed: bool = False
     has_mirror: bool = True
 
 
-class GivenAnswer(NamedTuple):
-    """An answer in one language. fields: Those beyond the paper's three. failure: Why it could not be made."""
-
-    model: str
-    reply: Reply
-    fields: tuple[str, ...] = ()
-    failure: str | None = None
+Answers = dict[tuple[str, Language], Reply | str]  # by sample id and language; a text says why an answer failed
 
 
-Answers = dict[tuple[str, Language], GivenAnswer]  # by sample id and language
-
-
-def read_given(cfg: CaptionConfig) -> Answers:
-    """Read the file of captions or predictions that the settings name; there must be one."""
+def read_given(cfg: CaptionConfig) -> tuple[Answers, str]:
+    """Read the file of captions or predictions that the settings name; return also the names of their writers."""
     assert cfg.caption_file is not None
     if cfg.teacher_kind == "student":
         return read_student(cfg.caption_file, cfg.student.run)
-    return read_foreign(cfg.caption_file)
+    return read_foreign(cfg.caption_file), cfg.caption_file.name
 
 
 def read_foreign(path: Path) -> Answers:
@@ -77,19 +65,16 @@ def read_foreign(path: Path) -> Answers:
         if (sample_id, "en") in answers:
             what = "the file has two captions for the same window"
             raise InputError(what, where=f"{path}:{number}: sample_id", got=sample_id)
-        more = caption.model_dump(include={"therefore"}, exclude_none=True)
         texts: dict[Language, Coc | None] = {"en": caption.en, "zh": caption.zh}
         for language, coc in texts.items():
             if coc is not None:
-                fields = more if language == "en" else {}
-                reply = Reply(dump_json(coc.model_dump() | fields), None, "native", "stop")
-                answers[sample_id, language] = GivenAnswer(path.name, reply, tuple(fields))
+                answers[sample_id, language] = Reply(dump_json(coc.model_dump()), None, "native", "stop")
     if not answers:
         raise InputError("the file contains no caption", where=path, fix=fix)
     return answers
 
 
-def read_student(path: Path, run: str | None = None) -> Answers:
+def read_student(path: Path, run: str | None = None) -> tuple[Answers, str]:
     """Read the predictions of a student for the windows of one tree; one that does not parse is refused later.
 
     Args:
@@ -98,13 +83,12 @@ def read_student(path: Path, run: str | None = None) -> Answers:
     predictions = read_predictions(path)
     runs = ", ".join(sorted({prediction.run for prediction in predictions}))
     chosen = [prediction for prediction in predictions if run in (None, prediction.run)]
-    answers: Answers = {}
-    for one in chosen:
-        reply = Reply(one.raw, None, "plain", "stop" if one.is_finished else "length")
-        failure = one.reason if one.reason and one.reason.startswith(FAILED) else None
-        answers[one.window_id or one.sample_id, one.language] = GivenAnswer(
-            one.model or "a student", reply, (), failure
-        )
+    answers: Answers = {
+        (one.window_id or one.sample_id, one.language): one.reason
+        if one.reason and one.reason.startswith(FAILED)
+        else Reply(one.raw, None, "plain", "stop" if one.is_finished else "length")
+        for one in chosen
+    }
     if len(answers) < len(chosen):
         fix = "choose one of these trees with --set caption.student.run=NAME"
         what = "the predictions are for several trees with the same track names"
@@ -112,25 +96,19 @@ def read_student(path: Path, run: str | None = None) -> Answers:
     if not answers:
         expected, fix = f"one of {runs}" if runs else None, "pass the output of cosfly distill infer"
         raise InputError("the file contains no prediction", where=path, got=run, expected=expected, fix=fix)
-    return answers
+    return answers, ", ".join(sorted({one.model or "a student" for one in chosen}))
 
 
 class GivenTeacher:
     """Answers from a file of captions or predictions."""
 
     def __init__(self, cfg: CaptionConfig, seed: int) -> None:
-        self._answers = read_given(cfg)
-        self.record = TeacherRecord(
-            kind=cfg.teacher_kind,
-            model=", ".join(sorted({answer.model for answer in self._answers.values()})),
-            settings=TeacherSettings(seed=seed),
-            run=cfg.student.run if cfg.teacher_kind == "student" else None,
-        )
+        self._answers, model = read_given(cfg)
+        run = cfg.student.run if cfg.teacher_kind == "student" else None
+        self.record = TeacherRecord(kind=cfg.teacher_kind, model=model, settings=TeacherSettings(seed=seed), run=run)
 
     def terms(self, sample_id: str) -> Terms:
-        english, has_mirror = self._answers.get((sample_id, "en")), (sample_id, "zh") in self._answers
-        fields = english.fields if english else ()
-        return Terms("prose", fields, is_given=True, is_fixed=True, has_mirror=has_mirror)
+        return Terms("prose", is_given=True, is_fixed=True, has_mirror=(sample_id, "zh") in self._answers)
 
     async def ask(self, question: Question) -> Reply:
         return self._answer(question, "en")
@@ -140,8 +118,7 @@ class GivenTeacher:
 
     def _answer(self, question: Question, language: Language) -> Reply:
         sample_id = question.window.sample_id
-        answer = self._answers.get((sample_id, language))
-        failure = NOT_IN_FILE if answer is None else answer.failure
-        if answer is None or failure is not None:
-            raise NoAnswer(str(failure), sample_id, is_final=True)
-        return answer.reply
+        answer = self._answers.get((sample_id, language), NOT_IN_FILE)
+        if isinstance(answer, str):
+            raise NoAnswer(answer, sample_id, is_final=True)
+        return answer

@@ -53,7 +53,7 @@ class RuleTeacher:
         self.record = TeacherRecord(kind="rules", model=MODEL, settings=settings, structured="native")
 
     def terms(self, sample_id: str) -> Terms:
-        return Terms("slots", tuple(THEREFORE))
+        return Terms("slots")
 
     def _answers(self, question: Question) -> tuple[dict[str, str], dict[str, str]]:
         """Return the English and the Chinese answer; a correction does not change them."""
@@ -117,7 +117,7 @@ class AskingTeacher:
         self.record = TeacherRecord(kind=kind, model=kept.engine.model, settings=settings)
 
     def terms(self, sample_id: str) -> Terms:
-        return self.student.terms if self.student else Terms(self.cfg.writing, tuple(THEREFORE))
+        return self.student.terms if self.student else Terms(self.cfg.writing)
 
     async def ask(self, question: Question) -> Reply:
         if self.student is not None:
