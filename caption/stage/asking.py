@@ -66,6 +66,7 @@ class Asking:
         self.retried = frozenset(self.quarantine) if retry_failed else frozenset[str]()
         most_in_flight = max(cfg.most_in_flight, cfg.judge.concurrency if cfg.judge.url else 0)
         self.slots = asyncio.Semaphore(most_in_flight + WAITING_WINDOWS)  # one for each window in work
+        self.begun: dict[TrackInput, list[asyncio.Task[Caption | None]]] = {}  # the windows of tracks in work
         self.num_failed_in_row = 0
         self.dropped: Counter[str] | None = Counter()  # of the windows that were asked; None once one was accepted
 
@@ -81,16 +82,15 @@ class Asking:
             with AnswerBook(path / ANSWERS) as answers, AnswerBook(path / JUDGEMENTS) as judgements:
                 self.books = (answers, judgements)
                 budget = first_budget(self.cfg, answers.totals, judgements.totals)
-                total = sum(guesses)
-                with progress_bar("caption", total) as advance:
-                    self.progress = RunProgress(advance, total, budget, troubles)
+                with progress_bar("caption", sum(guesses)) as advance:
+                    self.progress = RunProgress(advance, sum(guesses), budget, troubles)
                     async with (
                         open_teacher(self.cfg, answers, self.seed, budget, self.retried, troubles) as teacher,
                         open_judge(self.cfg.judge, self.vocabulary, self.seed, judgements, budget, troubles) as judge,
                     ):
                         self.judge = judge
                         await self._ask_all(tracks, guesses, teacher)
-                if self.progress.num_now or troubles.num:
+                if self.progress.windows.input or troubles.num:
                     log.info("caption: %s", self.progress.figures())
                 if judgements.totals:
                     self.outcome.judge_usage = Usage(**{name: judgements.totals[name] for name in Usage.model_fields})
@@ -125,12 +125,14 @@ class Asking:
             raise errors.exceptions[0] from None
         finally:
             heartbeat.cancel()
+            for track in self.begun:
+                self._write_gap(track)
 
     async def _ask_track(self, track: TrackInput, teacher: Teacher, tasks: asyncio.TaskGroup) -> None:
         """Begin the windows of a track; another task writes it after the last of them."""
         tally = self.outcome.tracks
         tally.input += 1
-        windows: list[asyncio.Task[Caption | None]] = []
+        windows = self.begun[track] = []
         is_cut = False
         try:
             for window in track.windows(self.cfg):
@@ -141,41 +143,35 @@ class Asking:
                     break
                 windows.append(tasks.create_task(self._ask_window(window, teacher)))
         except InputError as error:
+            del self.begun[track]
             self.failures.append(Failed(id=track.name, code=error.code, message=str(error)))
             tally.failed[error.code] += 1
             log.error("caption: %s: %s", track.name, error)
             return
-        except BaseException:
-            tally.kept += 1
-            self._write_gap(track, windows)
-            raise
         if windows or is_cut:
             tally.kept += 1
         else:
             tally.dropped["too_short"] += 1
-        tasks.create_task(self._write_track(track, windows, is_cut))
+        tasks.create_task(self._write_track(track, is_cut))
 
-    async def _write_track(self, track: TrackInput, windows: list[asyncio.Task[Caption | None]], is_cut: bool) -> None:
+    async def _write_track(self, track: TrackInput, is_cut: bool) -> None:
         """Write the part of a track after its last window. One with a gap stays unfinished, for the next run."""
-        try:
-            answers = await asyncio.gather(*windows)
-        except BaseException:
-            self._write_gap(track, windows)
-            raise
+        answers = await asyncio.gather(*self.begun[track])
         captions = [caption for caption in answers if caption is not None]
-        if is_cut or len(captions) < len(windows):
-            self._write_gap(track, windows)
+        if is_cut or len(captions) < len(answers):
+            self._write_gap(track)
         else:
             if captions:
                 write_captions(track.part(self.stage.path), captions)
             track.gap(self.stage.path).unlink(missing_ok=True)
+        del self.begun[track]
         for book in self.books:
             book.forget(track.name)
 
-    def _write_gap(self, track: TrackInput, windows: list[asyncio.Task[Caption | None]]) -> None:
+    def _write_gap(self, track: TrackInput) -> None:
         """Write the captions of a track that stays unfinished, for the report."""
         gap = track.gap(self.stage.path)
-        done = [window for window in windows if window.done() and not window.cancelled() and not window.exception()]
+        done = [task for task in self.begun[track] if task.done() and not task.cancelled() and not task.exception()]
         captions = [caption for caption in (window.result() for window in done) if caption is not None]
         if captions:
             write_captions(gap, captions)
@@ -270,56 +266,53 @@ class RunProgress:
     """Counts the outcomes of windows and moves the progress bar."""
 
     def __init__(self, advance: Advance, total: int, budget: Budget, troubles: Troubles) -> None:
-        self._advance, self.total, self.budget, self.troubles = advance, total, budget, troubles
-        self.num_before = self.num_accepted = self.num_repaired = self.num_unanswered = 0
-        self.dropped: Counter[str] = Counter()
+        self._advance, self.num_left, self.budget, self.troubles = advance, total, budget, troubles
+        self.windows = Tally()  # of this run
+        self.num_repaired = 0
         self._start_s = time.monotonic()
         self._tokens_before = Counter(budget.totals)
         self._spent_before = budget.spent
 
     def skip(self, num_windows: int) -> None:
         """Count windows of an earlier run."""
-        self.num_before += num_windows
+        self.num_left -= num_windows
         self.show(num_windows)
 
     def add(self, caption: Caption | None) -> None:
         """Count a caption, None for a window without an answer."""
+        self.num_left -= 1
+        self.windows.input += 1
         if caption is None or caption.drop_reason == "refused":
-            self.num_unanswered += 1
+            self.windows.failed["no_answer"] += 1
         elif caption.status == "accepted":
-            self.num_accepted += 1
+            self.windows.kept += 1
             self.num_repaired += caption.repair is not None
         else:
-            self.dropped[str(caption.drop_reason)] += 1
+            self.windows.dropped[str(caption.drop_reason)] += 1
         self.show(1)
 
     def show(self, num_windows: int = 0) -> None:
         """Move the progress bar by so many windows, and update its text."""
         self._advance(num_windows, self.figures())
 
-    @property
-    def num_now(self) -> int:
-        """Windows that this run finished, with or without success."""
-        return self.num_accepted + self.dropped.total() + self.num_unanswered
-
     def figures(self) -> str:
         """Return the figures of the run as a text."""
-        budget, troubles = self.budget, self.troubles
+        budget, troubles, windows = self.budget, self.troubles, self.windows
         tokens = Counter(budget.totals)
         tokens.subtract(self._tokens_before)
-        reasons = ", ".join(f"{reason} {count}" for reason, count in self.dropped.most_common(4))
-        rate_per_s = self.num_now / max(time.monotonic() - self._start_s, 1e-9)
+        reasons = ", ".join(f"{reason} {count}" for reason, count in windows.dropped.most_common(4))
+        rate_per_s = windows.input / max(time.monotonic() - self._start_s, 1e-9)
         figures = [
-            f"accepted {self.num_accepted:,} (repaired {self.num_repaired:,})",
-            f"dropped {self.dropped.total():,}" + (f" ({reasons})" if reasons else ""),
-            f"no answer {self.num_unanswered:,}",
+            f"accepted {windows.kept:,} (repaired {self.num_repaired:,})",
+            f"dropped {windows.dropped.total():,}" + (f" ({reasons})" if reasons else ""),
+            f"no answer {windows.failed.total():,}",
             f"tokens {tokens['prompt_tokens']:,} in {tokens['completion_tokens']:,} out",
             f"{rate_per_s:.2f} windows/s",
         ]
         if budget.cfg.price_prompt or budget.cfg.price_completion:
             figures.append(f"cost {budget.spent - self._spent_before:.2f}")
-        if self.num_now:
-            figures.append(f"{duration((self.total - self.num_before - self.num_now) / rate_per_s)} left")
+        if windows.input:
+            figures.append(f"{duration(self.num_left / rate_per_s)} left")
         if troubles.num:
             figures.append(f"{troubles.num:,} failed attempts")
         if troubles.last is not None:

@@ -15,7 +15,7 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from pydantic_core import to_json
@@ -26,7 +26,7 @@ from caption.teachers.foreign import GivenTeacher, Terms
 from caption.teachers.prompts import Question, mirror_messages, question_messages
 from caption.teachers.rules import MODEL, write_templates
 from caption.teachers.students import TrainedStudent
-from cosfly.formats.captions import Language, TeacherRecord, TeacherSettings
+from cosfly.formats.captions import TeacherRecord, TeacherSettings
 from cosfly.formats.places import flight_of
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.answers import BYTES_PER_TOKEN, PIXELS_PER_TOKEN, AnswerBook, Budget, KeptAnswers
@@ -40,7 +40,6 @@ from cosfly.viz.frame_views import Pictures
 
 ENCODING_THREADS = 4
 CACHE_FRAMES = 256  # encoded frames in memory, for the windows that share them
-Result = TypeVar("Result")
 EMBEDDED = ("rules", "file", "student")  # kinds of teacher that answer at once, in the process
 
 
@@ -120,41 +119,35 @@ class AskingTeacher:
         return self.student.terms if self.student else Terms(self.cfg.writing)
 
     async def ask(self, question: Question) -> Reply:
-        if self.student is not None:
-            return await self._ask_student(question, "en", question.decision, question.purpose, question.ask)
-        messages, digests = await self._in_thread(question_messages, question, self.encoder.encode)
-        schema = answer_schema(question.decision, more=THEREFORE)
-        return await self._ask_teacher(question, question.purpose, messages, digests, schema)
+        request = await self._in_thread(self._english, question)
+        return await self._kept_answer(question, question.purpose, request)
 
     async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply:
         purpose, decision = f"mirror/{ask}", english.coc.flight_decision
-        if self.student is not None:  # about the same window; its own decision, unless the English one was given
+        if self.student is None:
+            messages, schema = mirror_messages(question, english, complaint), answer_schema(decision, "zh")
+            request = self.cfg.endpoint.request(messages, [], schema, self._seed_of(question, purpose))
+        else:  # about the same window; its own decision, unless the English one was given
             given = decision if question.decision else None
-            return await self._ask_student(question, "zh", given, purpose, ask)
-        messages = mirror_messages(question, english, complaint)
-        return await self._ask_teacher(question, purpose, messages, [], answer_schema(decision, "zh"))
+            request = await self._in_thread(self.student.request, question, "zh", given, self.encoder.encode, ask)
+        return await self._kept_answer(question, purpose, request)
 
-    async def _ask_teacher(
-        self, question: Question, purpose: str, messages: list[dict], digests: list[str], schema: dict
-    ) -> Reply:
-        """Ask with a sampling seed that is the same in every run, and another for every ask of a window."""
-        item = f"{question.window.sample_id}/{purpose}"
-        seed = int(rng_for(self.seed, "teacher", item).integers(1 << 31))
-        return await self._kept_answer(question, self.cfg.endpoint.request(messages, digests, schema, seed), purpose)
+    def _english(self, question: Question) -> Request:
+        if self.student is not None:
+            return self.student.request(question, "en", question.decision, self.encoder.encode, question.ask)
+        messages, digests = question_messages(question, self.encoder.encode)
+        schema = answer_schema(question.decision, more=THEREFORE)
+        return self.cfg.endpoint.request(messages, digests, schema, self._seed_of(question, question.purpose))
 
-    async def _ask_student(
-        self, question: Question, language: Language, decision: str | None, purpose: str, seed: int
-    ) -> Reply:
-        assert self.student is not None
-        make, encode = self.student.request, self.encoder.encode
-        request = await self._in_thread(make, question, language, decision, encode, seed)
-        return await self._kept_answer(question, request, purpose)
+    def _seed_of(self, question: Question, purpose: str) -> int:
+        """Return a sampling seed that is the same in every run, and another for every ask of a window."""
+        return int(rng_for(self.seed, "teacher", f"{question.window.sample_id}/{purpose}").integers(1 << 31))
 
-    async def _in_thread(self, function: Callable[..., Result], *args: Any) -> Result:
-        """Call a function that reads and encodes pictures without blocking the other windows."""
-        return await asyncio.get_running_loop().run_in_executor(self._threads, function, *args)
+    async def _in_thread(self, make: Callable[..., Request], *args: Any) -> Request:
+        """Make a request, which reads and encodes pictures, without blocking the other windows."""
+        return await asyncio.get_running_loop().run_in_executor(self._threads, make, *args)
 
-    async def _kept_answer(self, question: Question, request: Request, purpose: str) -> Reply:
+    async def _kept_answer(self, question: Question, purpose: str, request: Request) -> Reply:
         sample_id = question.window.sample_id
         return await self.kept.ask(request, flight_of(sample_id), sample_id, purpose)
 
