@@ -15,14 +15,13 @@ from caption.schema import CaptionConfig, FutureMotion, ImageConfig, ObservedWin
 from caption.stage.stage import run
 from caption.stage.windows import current_frames, cut_future, cut_windows, recorded_motion
 from caption.teachers.prompts import make_question, question_messages
-from caption.teachers.teacher import FrameEncoder
+from caption.teachers.teacher import encode_frame
 from caption.verification.actions import TABLE, measure
 from caption.verification.facts import measure_facts
 from cosfly.formats.boxes import MapHeader, make_box_map
 from cosfly.formats.playback import Perturbation, Track, read_track, write_track
 from cosfly.formats.segments import Mission
 from cosfly.formats.tracks import find_tracks, read_twin
-from cosfly.llm.student_chat import encoded_image
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, perturb
 from specimens import make_flight, make_playback_tree
 
@@ -109,7 +108,9 @@ def test_changing_all_future_frames_leaves_prompts_and_pictures_identical(tree, 
     for root in (tree, spoiled):
         sample = next(s for s in cut_windows(flight_in(root), NO_IMAGES) if s.observed.indices[-1] == current)
         question = make_question(sample.observed, cfg, "prose", VOCABULARY)
-        messages, digests = question_messages(question, FrameEncoder(encoded_image).encode)
+        messages, digests = question_messages(
+            question, [encode_frame(one, question.pictures) for one in sample.observed.frame_folders]
+        )
         found.append((question.asked, json.dumps(messages), digests))
     assert found[0] == found[1]
     # The comparison can fail: a frame that is observed does reach the request.

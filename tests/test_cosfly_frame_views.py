@@ -16,7 +16,7 @@ from caption.schema import CaptionConfig, ImageConfig, Window, WindowConfig
 from caption.stage.window_loop import caption_window
 from caption.stage.windows import cut_windows
 from caption.teachers.prompts import make_question, question_messages
-from caption.teachers.teacher import FrameEncoder, RuleTeacher
+from caption.teachers.teacher import RuleTeacher, encode_frame
 from cosfly.formats.captions import PICTURES_MARK, Language
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
@@ -74,7 +74,9 @@ def window(tree) -> Window:
 
 def ask(window: Window, cfg: ImageConfig) -> tuple[dict[Language, str], list[np.ndarray]]:
     question = make_question(window.observed, cfg, "prose", VOCABULARY)
-    messages, _ = question_messages(question, FrameEncoder(partial(encoded_image, encoding="png")).encode)
+    encode = partial(encoded_image, encoding="png")
+    frames = [encode_frame(folder, question.pictures, encode) for folder in window.observed.frame_folders]
+    messages, _ = question_messages(question, frames)
     assert messages[1]["content"][-1]["text"] == question.asked["en"].user
     return {language: prompt.user for language, prompt in question.asked.items()}, sent_pictures(messages)
 

@@ -30,7 +30,7 @@ from cosfly.runtime.console import Advance, progress_bar
 from cosfly.runtime.errors import TeacherError
 from cosfly.runtime.json_io import parse_json
 from cosfly.runtime.model_json import DECLINED
-from cosfly.viz.frame_views import VIEW_FILES, Pictures
+from cosfly.viz.frame_views import VIEW_FILES
 
 State = Literal["ok", "warning", "unusable"]
 
@@ -202,17 +202,6 @@ class _Examination:
             self._add("context length", "unusable", f"{cut} without an error; {MEANINGS['too_long'].fix}")
         else:
             self._add("context length", "ok", f"{detail}{known}")
-        self._add_speed(seconds)
-
-    async def _cuts_prompts(self, used: int | None) -> bool:
-        """Return whether a longer prompt counts no more tokens than the largest one."""
-        system, question, *correction = self.largest
-        padded = question | {"content": [*question["content"], {"type": "text", "text": PADDING}]}
-        num_tokens = _prompt_tokens(await self._ask([system, padded, *correction], MIN_TOKENS))
-        return used is not None and num_tokens is not None and num_tokens <= used
-
-    def _add_speed(self, seconds: float) -> None:
-        """Report the time of one answer, and what it means if the server answers one request at a time."""
         endpoint = self.cfg.endpoint
         queued_s = endpoint.concurrency * seconds
         detail = f"{seconds:.1f} s for one answer to the largest prompt"
@@ -223,6 +212,13 @@ class _Examination:
                 "sends more only while answers are quick"
             )
         self._add("speed", "ok", detail)
+
+    async def _cuts_prompts(self, used: int | None) -> bool:
+        """Return whether a longer prompt counts no more tokens than the largest one."""
+        system, question, *correction = self.largest
+        padded = question | {"content": [*question["content"], {"type": "text", "text": PADDING}]}
+        num_tokens = _prompt_tokens(await self._ask([system, padded, *correction], MIN_TOKENS))
+        return used is not None and num_tokens is not None and num_tokens <= used
 
 
 def _prompt_tokens(reply: Reply | str) -> int | None:
@@ -263,17 +259,19 @@ def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary) -> list[dict]:
         correction=Correction(refused, refused[:MAX_COMPLAINT], 1),
     )
 
-    def draw(folder: Path, pictures: Pictures) -> list[EncodedImage]:
+    def draw(number: int) -> list[EncodedImage]:
         """Draw the pictures of a frame: random blocks, so that their files are as large as those of detailed frames."""
-        num_views, (width_px, height_px) = len(pictures.views), pictures.size_px
-        is_tiled = pictures.layout == "tiled"
-        num_columns = math.ceil(width_px * (num_views if is_tiled else 1) / BLOCK_PX)
-        shape = (1 if is_tiled else num_views, math.ceil(height_px / BLOCK_PX), num_columns, 3)
-        blocks = np.random.default_rng(int(folder.name)).integers(0, 256, shape, dtype=np.uint8)
+        pictures = question.pictures
+        width_px, height_px = pictures.size_px
+        num_pictures, num_columns = len(pictures.views), 1
+        if pictures.layout == "tiled":
+            num_pictures, num_columns = 1, num_pictures
+        shape = (num_pictures, math.ceil(height_px / BLOCK_PX), math.ceil(num_columns * width_px / BLOCK_PX), 3)
+        blocks = np.random.default_rng(number).integers(0, 256, shape, dtype=np.uint8)
         large = blocks.repeat(BLOCK_PX, axis=1).repeat(BLOCK_PX, axis=2)
-        return [encoded_image(picture[:height_px, : width_px * (num_views if is_tiled else 1)]) for picture in large]
+        return [encoded_image(picture[:height_px, : num_columns * width_px]) for picture in large]
 
-    return question_messages(question, draw)[0]
+    return question_messages(question, [draw(number) if question.pictures.views else [] for number in range(count)])[0]
 
 
 def _user(text: str, pictures: list[dict] | None = None) -> dict:

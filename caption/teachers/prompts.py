@@ -5,10 +5,9 @@ Nothing here reads the future. Every caption records the hash of its question.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 from caption.answer_formats.formats import FORMATS, AnswerFormat, Draft
 from caption.schema import ImageConfig, ObservedWindow
@@ -23,7 +22,7 @@ from cosfly.runtime.json_io import dump_json
 from cosfly.viz.frame_views import VIEW_FILES, Pictures, scaled_size
 
 MAX_RETURNED_CHARACTERS = 6000  # of a refused answer that is returned to its teacher
-EncodeFrame = Callable[[Path, Pictures], list[EncodedImage]]  # the pictures of a frame, by its folder
+Frames = Sequence[Sequence[EncodedImage]]  # the pictures of each frame, oldest first
 
 
 @dataclass(frozen=True)
@@ -215,13 +214,12 @@ def _paper_state(window: ObservedWindow, facts: Facts, language: Language) -> di
 # --- requests ---------------------------------------------------------------------------------------------------------
 
 
-def question_messages(question: Question, encode: EncodeFrame) -> tuple[list[dict], list[str]]:
+def question_messages(question: Question, frames: Frames) -> tuple[list[dict], list[str]]:
     """Return the chat messages of a question and the digests of its pictures.
 
     The pictures come first, oldest first, each frame under its name, then the flight data: windows of one flight share
     the system prompt as a prefix and four of five frames as identical pictures.
     """
-    frames = encode_frames(question, encode)
     parts = [[{"type": "image_url", "image_url": {"url": image.url}} for image in images] for images in frames]
     table = question.format.table(question.facts)
     text = question.asked["en"].user + ("\n" + table if table else "")
@@ -233,12 +231,6 @@ def question_messages(question: Question, encode: EncodeFrame) -> tuple[list[dic
             {"role": "user", "content": [{"type": "text", "text": complaint}]},
         ]
     return messages, [image.digest for images in frames for image in images]
-
-
-def encode_frames(question: Question, encode: EncodeFrame) -> list[list[EncodedImage]]:
-    """Return the pictures of each frame of a question."""
-    pictures = question.pictures
-    return [encode(frame, pictures) if pictures.views else [] for frame in question.window.frame_folders]
 
 
 def mirror_messages(question: Question, english: Draft, complaint: str | None = None) -> list[dict]:

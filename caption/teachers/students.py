@@ -14,7 +14,7 @@ from pathlib import Path
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import Terms
 from caption.teachers.prompt_files import Vocabulary
-from caption.teachers.prompts import EncodeFrame, Question, encode_frames, regeneration_lines, system_prompt
+from caption.teachers.prompts import Frames, Question, regeneration_lines, system_prompt
 from cosfly.formats.captions import Language
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.contract import Request
@@ -100,7 +100,7 @@ class TrainedStudent:
         self.terms = Terms("prose", is_fixed=True, has_mirror="zh" in self.chat_format.prompts)
 
     def request(
-        self, question: Question, language: Language, decision: str | None, encode: EncodeFrame, seed: int
+        self, question: Question, language: Language, decision: str | None, frames: Frames, seed: int
     ) -> Request:
         """Return the request in one language: a student translates nothing. A regeneration adds its sentences to the
         English one, which the training did not have.
@@ -120,7 +120,6 @@ class TrainedStudent:
             )
         prompt, more = question.asked[language], regeneration_lines(question) if language == "en" else ""
         prompt = prompt.model_copy(update={"system": prompt.system + more})
-        frames = encode_frames(question, encode)
         schema = answer_schema(decision, language, place=self.chat_format.decision)
         return student_request(prompt, frames, schema, self._sampling, seed)
 

@@ -8,14 +8,12 @@ Chinese of an English answer; its complaint says what was wrong with the last on
 from __future__ import annotations
 
 import asyncio
-import threading
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic_core import to_json
@@ -78,29 +76,11 @@ def _native(answer: dict[str, str]) -> Reply:
     return Reply(to_json(answer).decode(), None, "native", "stop")  # a tenth of the time of the json module
 
 
-class FrameEncoder:
-    """Reads and encodes frames on any thread, each once; keeps the last CACHE_FRAMES of them."""
-
-    def __init__(self, encode: Callable[[np.ndarray], EncodedImage]) -> None:
-        self._encode = encode
-        self._cache: OrderedDict[tuple[Path, Pictures], Future[list[EncodedImage]]] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def encode(self, frame: Path, pictures: Pictures) -> list[EncodedImage]:
-        """Return the pictures of one frame, one per view or a tiled one; InputError if a file cannot be read."""
-        key = (frame, pictures)
-        with self._lock:
-            is_new = key not in self._cache
-            future = self._cache.setdefault(key, Future())
-            self._cache.move_to_end(key)
-            if len(self._cache) > CACHE_FRAMES:
-                self._cache.popitem(last=False)
-        if is_new:  # other threads wait for it
-            try:
-                future.set_result([self._encode(picture) for picture in pictures.read(frame)])
-            except Exception as error:
-                future.set_exception(error)
-        return future.result()
+def encode_frame(
+    frame: Path, pictures: Pictures, encode: Callable[[np.ndarray], EncodedImage] = encoded_image
+) -> list[EncodedImage]:
+    """Return the pictures of one frame, one per view or a tiled one; InputError if a file cannot be read."""
+    return [encode(picture) for picture in pictures.read(frame)] if pictures.views else []
 
 
 class AskingTeacher:
@@ -109,7 +89,8 @@ class AskingTeacher:
     def __init__(self, cfg: CaptionConfig, seed: int, kept: KeptAnswers, threads: Executor) -> None:
         self.cfg, self.seed, self.kept, self._threads = cfg, seed, kept, threads
         self.student = None if cfg.student.folder is None else TrainedStudent(cfg)
-        self.encoder = FrameEncoder(self.student.encode if self.student else encoded_image)
+        self._encode = self.student.encode if self.student else encoded_image
+        self._frames: dict[tuple[Path, Pictures], asyncio.Future[list[EncodedImage]]] = {}
         names = ("temperature", "top_p", "max_tokens", "extra_body")
         settings = TeacherSettings(**{name: getattr(cfg.endpoint, name) for name in names}, seed=seed)
         kind = "student" if self.student else kept.engine.kind
@@ -119,33 +100,40 @@ class AskingTeacher:
         return self.student.terms if self.student else Terms(self.cfg.writing)
 
     async def ask(self, question: Question) -> Reply:
-        request = await self._in_thread(self._english, question)
-        return await self._kept_answer(question, question.purpose, request)
+        frames, purpose = await self._encoded(question), question.purpose
+        if self.student is not None:
+            request = self.student.request(question, "en", question.decision, frames, question.ask)
+        else:
+            messages, digests = question_messages(question, frames)
+            schema = answer_schema(question.decision, more=THEREFORE)
+            request = self.cfg.endpoint.request(messages, digests, schema, self._seed_of(question, purpose))
+        return await self._kept_answer(question, purpose, request)
 
     async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply:
         purpose, decision = f"mirror/{ask}", english.coc.flight_decision
-        if self.student is None:
+        if self.student is not None:  # about the same window; its own decision, unless the English one was given
+            given = decision if question.decision else None
+            request = self.student.request(question, "zh", given, await self._encoded(question), ask)
+        else:
             messages, schema = mirror_messages(question, english, complaint), answer_schema(decision, "zh")
             request = self.cfg.endpoint.request(messages, [], schema, self._seed_of(question, purpose))
-        else:  # about the same window; its own decision, unless the English one was given
-            given = decision if question.decision else None
-            request = await self._in_thread(self.student.request, question, "zh", given, self.encoder.encode, ask)
         return await self._kept_answer(question, purpose, request)
-
-    def _english(self, question: Question) -> Request:
-        if self.student is not None:
-            return self.student.request(question, "en", question.decision, self.encoder.encode, question.ask)
-        messages, digests = question_messages(question, self.encoder.encode)
-        schema = answer_schema(question.decision, more=THEREFORE)
-        return self.cfg.endpoint.request(messages, digests, schema, self._seed_of(question, question.purpose))
 
     def _seed_of(self, question: Question, purpose: str) -> int:
         """Return a sampling seed that is the same in every run, and another for every ask of a window."""
         return int(rng_for(self.seed, "teacher", f"{question.window.sample_id}/{purpose}").integers(1 << 31))
 
-    async def _in_thread(self, make: Callable[..., Request], *args: Any) -> Request:
-        """Make a request, which reads and encodes pictures, without blocking the other windows."""
-        return await asyncio.get_running_loop().run_in_executor(self._threads, make, *args)
+    async def _encoded(self, question: Question) -> list[list[EncodedImage]]:
+        """Return the pictures of each frame; threads read and encode a frame once for the windows that share it."""
+        loop, frames = asyncio.get_running_loop(), []
+        for folder in question.window.frame_folders:
+            key = (folder, question.pictures)
+            if key not in self._frames:
+                self._frames[key] = loop.run_in_executor(self._threads, encode_frame, *key, self._encode)
+            frames.append(asyncio.shield(self._frames[key]))
+        while len(self._frames) > CACHE_FRAMES:
+            del self._frames[next(iter(self._frames))]
+        return await asyncio.gather(*frames)
 
     async def _kept_answer(self, question: Question, purpose: str, request: Request) -> Reply:
         sample_id = question.window.sample_id

@@ -31,7 +31,7 @@ from caption.schema import CaptionConfig
 from caption.stage.asking import Asking
 from caption.stage.stage import open_stage
 from caption.stage.tracks import find_inputs
-from caption.teachers.teacher import AskingTeacher, FrameEncoder
+from caption.teachers import teacher
 from cosfly.formats.frames import SKY_DEPTH_M
 from cosfly.llm import protocol
 from cosfly.viz.frame_views import VIEW_FILES
@@ -55,8 +55,8 @@ def main() -> None:
         tree = _make_tree(folder / "tree", args.windows)
         cfg = _settings(url, args.concurrency)
         # First run: pictures on the way, cold. Second: another folder, the same pictures already encoded.
-        cold_s, bodies, encoder = _client(cfg, tree, folder / "cold", None)
-        warm_s, _, _ = _client(cfg, tree, folder / "warm", encoder)
+        cold_s, bodies, encoded = _client(cfg, tree, folder / "cold", None)
+        warm_s, _, _ = _client(cfg, tree, folder / "warm", encoded)
         pool_s = asyncio.run(_bare(url, bodies, args.concurrency, 1))
         own_s = asyncio.run(_bare(url, bodies, args.concurrency, args.concurrency))
     finally:
@@ -80,39 +80,38 @@ def _settings(url: str, concurrency: int) -> CaptionConfig:
 
 
 def _client(
-    cfg: CaptionConfig, tree: Path, out: Path, encoder: FrameEncoder | None
-) -> tuple[float, list[bytes], FrameEncoder]:
+    cfg: CaptionConfig, tree: Path, out: Path, known: dict | None
+) -> tuple[float, list[bytes], dict[tuple, list]]:
     """Caption the tree; gives seconds, the bodies sent (of the cold run alone: to keep them takes time), and the
-    pictures.
+    pictures of each frame.
 
     The product is not merged: only asking counts.
     """
     stage = open_stage(cfg, tree, out, 0, "never")
     tracks, _ = find_inputs(cfg, tree)
     bodies: list[bytes] = []
-    teachers: list[AskingTeacher] = []
-    plain_init, plain_body = AskingTeacher.__init__, protocol.request_body
+    encoded: dict[tuple, list] = {} if known is None else known
+    plain_encode, plain_body = teacher.encode_frame, protocol.request_body
 
-    def init(self: AskingTeacher, *args) -> None:
-        plain_init(self, *args)
-        if encoder is not None:
-            self.encoder = encoder
-        teachers.append(self)
+    def encoding(*args: Any) -> list:
+        if args[:2] not in encoded:
+            encoded[args[:2]] = plain_encode(*args)
+        return encoded[args[:2]]
 
     def recording(*args: Any, **options: bool) -> bytes:
         bodies.append(plain_body(*args, **options))
         return bodies[-1]
 
-    AskingTeacher.__init__ = init  # type: ignore[method-assign, assignment]
-    protocol.request_body = recording if encoder is None else plain_body
+    teacher.encode_frame = encoding
+    protocol.request_body = recording if known is None else plain_body
     try:
         start_s = time.monotonic()
         asked = asyncio.run(Asking(stage, cfg, VOCABULARY, 0).run(tracks))
         seconds = time.monotonic() - start_s
     finally:
-        AskingTeacher.__init__, protocol.request_body = plain_init, plain_body  # type: ignore[method-assign, assignment]
+        teacher.encode_frame, protocol.request_body = plain_encode, plain_body
     assert not asked.unanswered, asked.unanswered[:3]
-    return seconds, bodies, teachers[0].encoder
+    return seconds, bodies, encoded
 
 
 async def _bare(url: str, bodies: list[bytes], concurrency: int, num_clients: int) -> float:
