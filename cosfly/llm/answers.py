@@ -1,9 +1,8 @@
 """The journal of answers, which no run requests twice, and the budget of tokens and money.
 
-A folder has one journal per track, `answers/<track>.jsonl`, written by one process. Each answer is written to the file
-before anything is derived from it, so a killed process loses none. A thread syncs the disk, once for all answers that
-arrived meanwhile. Only tracks in progress are in memory. The budget counts the answers in the journals of all runs into
-one folder, so repeating a command does not spend it twice.
+A folder has one journal per track, `answers/<track>.jsonl`, written by a thread of one process. Each answer is on the
+disk before anything is derived from it, so a killed process loses none. Only tracks in progress are in memory. The
+budget counts the answers in the journals of all runs into one folder, so repeating a command does not spend it twice.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from cosfly.formats.captions import Usage
 from cosfly.llm.contract import MOST_TOKENS, CountName, Engine, Reply, Request
 from cosfly.runtime.config import Config
-from cosfly.runtime.errors import CosflyError, TeacherError
+from cosfly.runtime.errors import TeacherError
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.json_io import dump_json
@@ -33,7 +32,6 @@ from cosfly.runtime.model_json import CONTEXT_FULL, DECLINED
 
 log = logging.getLogger(__name__)
 
-MOST_OPEN_FILES = 64
 MOST_NAME_BYTES = 200  # of a file name without its ending; file systems allow 255 with it
 BYTES_PER_TOKEN = 3  # of a prompt; a low estimate keeps the spending within the budget
 PIXELS_PER_TOKEN = 28 * 28  # of common vision encoders
@@ -92,9 +90,6 @@ class AnswerBook:
                 self._count(answer)
         self._tracks: dict[str, tuple[Journal, dict[str, Answer]]] = {}  # a track's journal, and its answers by key
         self._disk = ThreadPoolExecutor(1, "journal")
-        self._disk_lock = asyncio.Lock()
-        self._unsynced = set[Journal]()
-        self._disk_error: CosflyError | OSError | None = None
 
     def get(self, track: str, key: str) -> Answer | None:
         """Return the recorded answer of a key."""
@@ -104,41 +99,18 @@ class AnswerBook:
     async def put(self, track: str, answer: Answer) -> None:
         """Write an answer, and wait until it is on the disk; StorageError if the disk is full or not writable."""
         journal, answers = self._open(track)
-        journal.append(answer.model_dump(mode="json"), sync=False)
         answers[answer.key] = answer
         self._count(answer)
-        self._unsynced.add(journal)
-        async with self._disk_lock:
-            if self._disk_error is not None:  # a later sync may succeed without the lost lines
-                raise self._disk_error
-            if journal in self._unsynced:  # otherwise another answer has synced it meanwhile
-                await self._sync()
 
-    async def _sync(self) -> None:
-        batch = self._unsynced
-        self._unsynced = set()
+        def append() -> None:
+            with journal:  # closed again, so that many tracks in progress take no more files than one
+                journal.append(answer.model_dump(mode="json"))
 
-        def sync_all() -> None:
-            for journal in batch:
-                journal.sync()
-
-        try:
-            await asyncio.get_running_loop().run_in_executor(self._disk, sync_all)
-        except asyncio.CancelledError:
-            self._unsynced |= batch
-            raise
-        except (CosflyError, OSError) as error:
-            self._disk_error = error
-            raise
-        if len(self._tracks) > MOST_OPEN_FILES:  # the next line opens its file again
-            for journal in batch - self._unsynced:
-                journal.close()
+        await asyncio.get_running_loop().run_in_executor(self._disk, append)
 
     def forget(self, track: str) -> None:
         """Remove a finished track from memory; its journal stays on the disk."""
-        if track in self._tracks:
-            journal, _ = self._tracks.pop(track)
-            journal.close()
+        self._tracks.pop(track, None)
 
     def _open(self, track: str) -> tuple[Journal, dict[str, Answer]]:
         if track not in self._tracks:
@@ -159,8 +131,6 @@ class AnswerBook:
 
     def __exit__(self, *_: object) -> None:
         self._disk.shutdown(wait=True)
-        for track in list(self._tracks):
-            self.forget(track)
 
 
 # --- the budget -------------------------------------------------------------------------------------------------------
@@ -244,15 +214,19 @@ class Budget:
             largest_prompt, largest_completion = self._largest.get(pictures, self._first)
             prompt += count * largest_prompt
             completion += count * largest_completion
-        totals = self.totals
+        totals, cfg = self.totals, self.cfg
         tokens = totals["prompt_tokens"] + totals["completion_tokens"]
-        if self.cfg.max_tokens is not None and tokens + prompt + completion > self.cfg.max_tokens:
-            problem = f"the next request may exceed the limit: {tokens:,} of {self.cfg.max_tokens:,} tokens are used"
-            return BudgetSpent(problem, where="budget.max_tokens", fix="raise the limit and run the same command again")
-        if self.cfg.max_cost is not None and self.spent + self.cfg.cost(prompt, completion) > self.cfg.max_cost:
-            problem = f"the next request may exceed the limit: {self.spent:.4f} of {self.cfg.max_cost:g} is spent"
-            return BudgetSpent(problem, where="budget.max_cost", fix="raise the limit and run the same command again")
-        return None
+        if cfg.max_tokens is not None and tokens + prompt + completion > cfg.max_tokens:
+            name, used = "max_tokens", f"{tokens:,} of {cfg.max_tokens:,} tokens are used"
+        elif cfg.max_cost is not None and self.spent + cfg.cost(prompt, completion) > cfg.max_cost:
+            name, used = "max_cost", f"{self.spent:.4f} of {cfg.max_cost:g} is spent"
+        else:
+            return None
+        problem, fix = (
+            f"the next request may exceed the limit: {used}",
+            "raise the limit and run the same command again",
+        )
+        return BudgetSpent(problem, where=f"budget.{name}", fix=fix)
 
     def note(self, usage: Usage | None, where: str, num_pictures: int = 0) -> None:
         """Record the size of an answered request; raises TeacherError if a limit is set and no usage is reported."""
@@ -293,37 +267,38 @@ class KeptAnswers:
 
     async def ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:
         """Return the recorded answer, or ask the engine; NoAnswer fails this request, TeacherError all requests."""
-        reply = await self._ask(request, track, sample_id, purpose)
-        self.listener(sample_id, request, reply)
-        return reply
-
-    async def _ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:
-        engine = self.engine
-        key = answer_key(engine.model, request)
-        num_pictures = len(request.digests)
+        key = answer_key(self.engine.model, request)
         # Equal requests wait for each other, so that the second takes the answer of the first.
         async with self._asking.setdefault(key, asyncio.Lock()):
             recorded = None if self.book is None else self.book.get(track, key)
             is_retried = sample_id in self.retried  # the context may be larger now
             if recorded is not None and not (is_retried and recorded.finish_reason in (CONTEXT_FULL, DECLINED)):
-                return recorded.reply
-            async with self.budget.request(num_pictures) if self.budget else contextlib.nullcontext():
-                start_s = time.monotonic()
-                reply = await engine.answer(request)
-                if self.book is not None:
-                    answer = Answer(
-                        key=key,
-                        sample_id=sample_id,
-                        purpose=purpose,
-                        model=engine.model,
-                        text=reply.text,
-                        usage=reply.usage.model_dump() if reply.usage else {},
-                        structured=reply.structured,
-                        finish_reason=reply.finish_reason,
-                        latency_s=round(time.monotonic() - start_s, 3),
-                        time=round(time.time(), 3),
-                    )
-                    await self.book.put(track, answer)  # on the disk before anything is derived from it
-            if self.budget is not None:
-                self.budget.note(reply.usage, engine.where, num_pictures)
-            return reply
+                reply = recorded.reply
+            else:
+                reply = await self._ask_engine(request, track, key, sample_id, purpose)
+        self.listener(sample_id, request, reply)
+        return reply
+
+    async def _ask_engine(self, request: Request, track: str, key: str, sample_id: str, purpose: str) -> Reply:
+        """Ask the engine within the budget, and record its answer before anything is derived from it."""
+        num_pictures = len(request.digests)
+        async with self.budget.request(num_pictures) if self.budget else contextlib.nullcontext():
+            start_s = time.monotonic()
+            reply = await self.engine.answer(request)
+            if self.book is not None:
+                answer = Answer(
+                    key=key,
+                    sample_id=sample_id,
+                    purpose=purpose,
+                    model=self.engine.model,
+                    text=reply.text,
+                    usage=reply.usage.model_dump() if reply.usage else {},
+                    structured=reply.structured,
+                    finish_reason=reply.finish_reason,
+                    latency_s=round(time.monotonic() - start_s, 3),
+                    time=round(time.time(), 3),
+                )
+                await self.book.put(track, answer)
+        if self.budget is not None:
+            self.budget.note(reply.usage, self.engine.where, num_pictures)
+        return reply

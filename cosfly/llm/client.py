@@ -38,7 +38,6 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # the pause after a failed try doubl
 LOADING, LOADING_PAUSE_S = "loading", 5.0  # a server that loads its model is waited for; this is no failed try
 FIRST_LIMIT = 2  # requests in flight until the first answer: a small server answers one after the other
 HEADROOM = 1 / 3  # more requests are sent while answers take less than this share of the time limit
-MOST_DOUBLINGS = 60  # keeps the power of two finite; the pause has reached its maximum long before
 # A server cuts prompts if so many token counts in a row are equal, though the texts differ by so many characters. Texts
 # that differ in a few digits count equal tokens anyway: many tokenizers make one token of up to three digits.
 NUM_EQUAL_PROMPTS, LEAST_SPREAD = 8, 50
@@ -177,8 +176,7 @@ class ChatClient:
 
         NoAnswer: The tries or the time are used up, or the server refuses it. TeacherError: All requests will fail.
         """
-        num_tries = 0
-        deadline_s = math.inf
+        num_tries, longest_s, deadline_s = 0, FIRST_PAUSE_S, math.inf
         while True:
             try:
                 async with self.concurrency.slot():
@@ -191,9 +189,9 @@ class ChatClient:
                 if error.is_final:
                     raise
                 failure = error
-            longest_s = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** min(num_tries, MOST_DOUBLINGS))
             pause_s = self._jitter.uniform(0.5, 1.0) * longest_s if failure.wait_s is None else failure.wait_s
-            num_tries += failure.cause != LOADING
+            if failure.cause != LOADING:
+                num_tries, longest_s = num_tries + 1, min(LONGEST_PAUSE_S, 2.0 * longest_s)
             is_last = num_tries >= self.cfg.max_tries
             is_late = time.monotonic() + pause_s >= deadline_s
             if self.troubles.failed(failure.detail):

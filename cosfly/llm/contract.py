@@ -151,25 +151,19 @@ def run_until_interrupted(main: Coroutine[Any, Any, Result], *, keeps_work: bool
 
     async def guarded() -> Result:
         task = asyncio.current_task()
-        loop = asyncio.get_running_loop()
+        assert task is not None
 
         def interrupt(number: signal.Signals) -> None:
             nonlocal received
             if received is not None:
                 os.write(2, AT_ONCE[keeps_work])
                 os._exit(128 + number)
-            assert task is not None
-            if task.cancel():
-                received = number
+            received = number
+            task.cancel()
 
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, interrupt, number)
-        try:
-            return await main
-        finally:
-            if received is None:  # otherwise they stay until the last task has ended
-                for number in previous:
-                    loop.remove_signal_handler(number)
+        for number in previous:
+            asyncio.get_running_loop().add_signal_handler(number, interrupt, number)
+        return await main
 
     previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

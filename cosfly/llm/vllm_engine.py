@@ -52,13 +52,8 @@ class VllmEngine:
             num_images: most pictures of one request. settings: section of `vllm` and `endpoint`, for messages.
         """
         if not (folder / "config.json").is_file():
-            expected = "a folder with config.json"
-            raise InputError(
-                "the folder contains no model",
-                where=folder,
-                expected=expected,
-                fix="pass vllm:MODEL_DIR with the folder of a model",
-            )
+            fix = "pass vllm:MODEL_DIR with the folder of a model"
+            raise InputError("the folder contains no model, which has a config.json", where=folder, fix=fix)
         self.folder = folder
         self.model = folder.name
         self.where = f"vllm:{folder}"
@@ -97,21 +92,16 @@ class VllmEngine:
         if importlib.util.find_spec("vllm") is None:
             raise EnvironmentMissing("the vLLM engine is not installed", where=self.where, fix=INSTALL)
         os.environ.setdefault("VLLM_NO_USAGE_STATS", "1")  # no telemetry
-        section = "vllm.engine"
         try:
             from vllm import LLM
 
-            section = "endpoint"
             self.parameters(self.sampling.request([], [], {}, 0))
-            section = "vllm.engine"
             return LLM(**self.arguments())
-        except (ImportError, RuntimeError, TypeError, ValueError, OSError) as error:
-            got = _one_line(error)
-            if isinstance(error, TypeError) or (section == "endpoint" and isinstance(error, ValueError)):
-                where = f"{self.settings}.{section}"
-                what, fix = f"vLLM rejects a setting in the section {section}", "correct or remove this setting"
-                raise ConfigError(what, where=where, got=got, fix=fix) from None
-            raise EnvironmentMissing("the vLLM engine does not start", where=self.where, got=got) from None
+        except TypeError as error:
+            where, fix = f"{self.settings}.vllm.engine, {self.settings}.endpoint", "correct or remove this setting"
+            raise ConfigError("vLLM rejects a setting", where=where, got=_one_line(error), fix=fix) from None
+        except (ImportError, RuntimeError, ValueError, OSError) as error:
+            raise EnvironmentMissing("the vLLM engine does not start", where=self.where, got=_one_line(error)) from None
 
     def arguments(self) -> dict[str, Any]:
         """Return the keyword arguments of `vllm.LLM`."""
