@@ -104,8 +104,8 @@ def test_mirror_check(en, zh, reason):
     ("It lies 21.4 m away at an angle of 45 degrees.", False),
     ("The drone flies at 1.46 m/s.", False),
     ("The drone flies at 20.6 m/s.", True),
-    ("It is roughly twenty-one metres away.", False),
-    ("It is roughly forty metres away.", True),
+    ("It is roughly 21 metres away.", False),
+    ("It is roughly 40 metres away.", True),
     ("The drone flies at 3.3 ft/s, 1.02 m/s.", False),  # a foreign unit of the same speed
     ("The distance should stay below 55 m.", False),  # a plan
     ("The manual allows no gap of more than 55 m.", False),

@@ -55,9 +55,9 @@ def _measured_series(f: Facts) -> dict[str, list[Series]]:
 
 
 def _numbers(texts: Sequence[str], language: Language) -> list[Numeral]:
-    """Return the numbers in digits, durations aside; the other language may write one in words."""
+    """Return the numbers of texts, durations aside."""
     found = (numeral for text in texts for numeral in read_numerals(text, language))
-    return [numeral for numeral in found if numeral.is_in_digits and numeral.unit not in ("s", "times")]
+    return [numeral for numeral in found if numeral.unit not in ("s", "times")]
 
 
 def _is_shared(number: Numeral, others: Sequence[Numeral], measured: dict[str, list[Series]]) -> bool:
