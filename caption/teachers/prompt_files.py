@@ -7,10 +7,9 @@ dollar sign.
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from pathlib import Path
 from string import Template
 
@@ -60,22 +59,23 @@ def own_prompts(folder: Path) -> dict[str, str]:
     if not folder.is_dir():
         raise ConfigError("the folder of prompts does not exist", where=folder, fix=export)
     found, problems = dict[str, str](), list[str]()
-    for path in sorted(folder.glob(f"*{SUFFIX}")):
-        found[path.stem] = ""
+    for name in sorted({*shipped_prompts(), *(path.stem for path in folder.glob(f"*{SUFFIX}"))}):
+        path = folder / f"{name}{SUFFIX}"
         try:
-            found[path.stem] = read_text(path, what="prompt", tree=folder)
+            found[name] = read_text(path, what="prompt", tree=folder)
+            problems += _problems(path, found[name])
         except InputError as error:
             problems.append(str(error))
-        else:
-            problems += _problems(path, found[path.stem])
-    problems += [f"{folder / name}{SUFFIX}: the file is missing" for name in shipped_prompts() if name not in found]
     for problem in problems:
         log.error("%s", problem)
     if problems:
-        got = problems[0] + (f", and {len(problems) - 1} more" if problems[1:] else "")
-        expected = "the files and slots of the built-in prompts"
-        fix = f"{len(problems)} to fix; {export}"
-        raise ConfigError("these prompts cannot be used", where=folder, got=got, expected=expected, fix=fix)
+        raise ConfigError(
+            "these prompts cannot be used",
+            where=folder,
+            got=problems[0] + (f", and {len(problems) - 1} more" if problems[1:] else ""),
+            expected="the files and slots of the built-in prompts",
+            fix=f"{len(problems)} to fix; {export}",
+        )
     return found
 
 
@@ -100,14 +100,6 @@ def _problems(path: Path, text: str) -> Iterator[str]:
 def slots_of(text: str) -> list[str]:
     """Return the names of the slots of a prompt, each once."""
     return Template(text).get_identifiers()
-
-
-@lru_cache
-def prompt_format(name: str, vocabulary: Vocabulary) -> str:
-    """Return a prompt as a format for `%`, which is ten times faster than a template."""
-    template = vocabulary.templates[name]
-    marked = template.substitute({slot: f"\0{slot}\0" for slot in template.get_identifiers()})
-    return re.sub("\0(.+?)\0", r"%(\1)s", marked.replace("%", "%%"))
 
 
 def export_prompts(folder: Path, texts: Mapping[str, str]) -> list[Path]:

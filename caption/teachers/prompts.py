@@ -11,7 +11,7 @@ from functools import lru_cache
 
 from caption.answer_formats.formats import FORMATS, AnswerFormat, Draft
 from caption.schema import ImageConfig, ObservedWindow
-from caption.teachers.prompt_files import Vocabulary, prompt_format
+from caption.teachers.prompt_files import Vocabulary
 from caption.verification.facts import Facts, measure_facts
 from caption.verification.glossary import LANGUAGES, form_of, prompt_line, translations, written_unit
 from caption.verification.references import QUANTITIES, Fact, Reference, look_up
@@ -101,24 +101,22 @@ def user_prompts(window: ObservedWindow, facts: Facts, vocabulary: Vocabulary) -
     users: dict[Language, str] = {}
     for language in LANGUAGES:
         state = _paper_state(window, facts, language) if is_paper else _relative_state(facts, language)
-        question = prompt_format(f"user_{language}", vocabulary) % (numbers | state)
+        question = vocabulary.templates[f"user_{language}"].substitute(numbers | state)
         users[language] = "\n".join([question, *_further_lines(window, facts, language)])
     return users
 
 
 def prompt_hash(question: Question) -> str:
     """Return the hash of a free question and its system prompts."""
-    standing = _standing_hash(*[prompt.system for prompt in question.prompts.values()], teacher_prompt(question))
+    standing = _hash_of([*[prompt.system for prompt in question.prompts.values()], teacher_prompt(question)])
     users = [
         prompt.user.replace(PICTURES_MARK, question.pictures.sentence(language))
         for language, prompt in question.prompts.items()
     ]
-    return sha256_bytes("\x00".join([standing, *users]).encode())[:16]
+    return _hash_of([standing, *users])[:16]
 
 
-@lru_cache(maxsize=16)
-def _standing_hash(*texts: str) -> str:
-    """Return the hash of the texts that are the same in every question."""
+def _hash_of(texts: Sequence[str]) -> str:
     return sha256_bytes("\x00".join(texts).encode())
 
 
