@@ -22,6 +22,7 @@ from caption.teachers.judge import open_judge
 from caption.teachers.prompt_files import Vocabulary
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
 from cosfly.formats.captions import Caption, Usage, read_captions, write_captions
+from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook, Budget, BudgetSpent
 from cosfly.llm.contract import STOP_AFTER_FAILURES, NoAnswer, Troubles
 from cosfly.runtime.console import SECONDS_BETWEEN_LINES, Advance, duration, progress_bar
@@ -64,6 +65,7 @@ class Asking:
         self.quarantine = read_quarantine(stage.path)
         # An answer that had filled the context, or in which the model declined, is asked for again.
         self.retried = frozenset(self.quarantine) if retry_failed else frozenset[str]()
+        self.retried_tracks = {flight_of(sample_id) for sample_id in self.retried}
         most_in_flight = max(cfg.most_in_flight, cfg.judge.concurrency if cfg.judge.url else 0)
         self.slots = asyncio.Semaphore(most_in_flight + WAITING_WINDOWS)  # one for each window in work
         self.begun: dict[TrackInput, list[asyncio.Task[Caption | None]]] = {}  # the windows of tracks in work
@@ -113,6 +115,8 @@ class Asking:
             async with asyncio.TaskGroup() as tasks:  # an error in one task cancels the others
                 for track, guess in zip(tracks, guesses, strict=True):
                     part = track.part(self.stage.path)
+                    if part.exists() and track.name in self.retried_tracks:  # it is unfinished again
+                        part.replace(track.gap(self.stage.path))
                     if part.exists():
                         if self.dropped is not None and any(one.status == "accepted" for one in read_captions(part)):
                             self.dropped = None

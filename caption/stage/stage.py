@@ -23,7 +23,6 @@ from caption.teachers.students import student_settings
 from caption.teachers.teacher import EMBEDDED, embedded_teacher
 from caption.verification.glossary import GLOSSARY_FILE
 from cosfly.formats.captions import caption_lines, line_of, write_caption_lines
-from cosfly.formats.places import flight_of
 from cosfly.llm.contract import run_until_interrupted
 from cosfly.llm.student_chat import student_files
 from cosfly.runtime.errors import ConfigError, ResumeError, TeacherError
@@ -82,20 +81,15 @@ def run(
         finished = run_items(stage, items, make_worker, args, workers=workers, watch=watch, label="caption")
         outcome = AskingOutcome(finished.tally)
     else:
-        if retry_failed:  # the tracks of windows in quarantine are unfinished again
-            names = {flight_of(sample_id) for sample_id in read_quarantine(stage.path)}
-            for track in tracks:
-                if track.name in names and track.part(stage.path).exists():
-                    track.part(stage.path).replace(track.gap(stage.path))
         asking = Asking(stage, cfg, vocabulary, seed, retry_failed=retry_failed)
         outcome = asking.outcome
         try:
             run_until_interrupted(asking.run(tracks))
         except (TeacherError, KeyboardInterrupt, SystemExit):
             if outcome.tracks.input:  # the report shows what was reached
-                _write_report(stage, cfg, tracks, outcome, unused, has_gaps=True)
+                _write_report(stage, cfg, tracks, outcome, unused)
             raise
-    report = _write_report(stage, cfg, tracks, outcome, unused, bool(outcome.unanswered))
+    report = _write_report(stage, cfg, tracks, outcome, unused)
     if unused and not is_cut:
         log.warning("caption: %d captions of %s match no window of this tree", len(unused), cfg.caption_file)
     for warning in report.warnings():
@@ -105,15 +99,24 @@ def run(
 
 
 def _write_report(
-    stage: StageFolder,
-    cfg: CaptionConfig,
-    tracks: list[TrackInput],
-    outcome: AskingOutcome,
-    unused: set[str],
-    has_gaps: bool,
+    stage: StageFolder, cfg: CaptionConfig, tracks: list[TrackInput], outcome: AskingOutcome, unused: set[str]
 ) -> CaptionReport:
-    """Write the captions so far, the report and its page. has_gaps: Tracks may be unfinished."""
-    report, cards = _merge(stage, parts_of(stage.path, tracks, has_gaps), unused)
+    """Join the parts so far to `captions.jsonl`, one at a time, and write the report and its page.
+
+    Args:
+        unused: Windows of a file of captions; those that are captioned are removed.
+    """
+    report, cards = CaptionReport(), SampleCards()
+
+    def lines() -> Iterator[bytes]:
+        for part in parts_of(stage.path, tracks):
+            for line, caption in caption_lines(part):
+                report.add(caption)
+                cards.add(caption)
+                unused.discard(caption.sample_id)
+                yield line.encode()
+
+    write_caption_lines(stage.path / PRODUCT, lines())
     report.finish(outcome.tracks, len(outcome.unanswered), outcome.judge_usage)
     write_json(stage.path / REPORT, report.as_json())
     folders = {track.name: track.folder for track in tracks}
@@ -186,26 +189,6 @@ def _has_more(stage: StageFolder, cfg: CaptionConfig, retry_failed: bool) -> boo
             fix="remove --limit, or raise it",
         )  # fmt: skip
     return True
-
-
-def _merge(stage: StageFolder, parts: list[Path], unused: set[str]) -> tuple[CaptionReport, SampleCards]:
-    """Join the parts to `captions.jsonl`, one at a time; return counts and samples of the captions.
-
-    Args:
-        unused: Windows of a file of captions; those that are captioned are removed.
-    """
-    report, cards = CaptionReport(), SampleCards()
-
-    def lines() -> Iterator[bytes]:
-        for part in parts:
-            for line, caption in caption_lines(part):
-                report.add(caption)
-                cards.add(caption)
-                unused.discard(caption.sample_id)
-                yield line.encode()
-
-    write_caption_lines(stage.path / PRODUCT, lines())
-    return report, cards
 
 
 # --- embedded teachers ------------------------------------------------------------------------------------------------

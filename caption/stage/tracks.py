@@ -92,10 +92,7 @@ def find_inputs(cfg: CaptionConfig, data: Path) -> tuple[list[TrackInput], bool]
     return inputs, False
 
 
-def parts_of(stage_path: Path, tracks: Sequence[TrackInput], with_gaps: bool) -> list[Path]:
+def parts_of(stage_path: Path, tracks: Sequence[TrackInput]) -> list[Path]:
     """Return the existing part files, or parts with gaps, in the order of the product."""
-    found: list[Path] = []
-    for track in tracks:
-        paths = [track.part(stage_path), track.gap(stage_path)] if with_gaps else [track.part(stage_path)]
-        found += [path for path in paths if path.exists()][:1]
-    return found
+    paths = [(track.part(stage_path), track.gap(stage_path)) for track in tracks]
+    return [part if part.exists() else gap for part, gap in paths if part.exists() or gap.exists()]
