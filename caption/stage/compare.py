@@ -114,20 +114,19 @@ async def _try_all(
             while len(trials) < most and (batch := list(itertools.islice(windows, cfg.most_in_flight))):
                 num_windows += len(batch)
                 found = await asyncio.gather(*(_try_each(window, teacher, cfg, vocabulary) for window in batch))
-                trials += [one for one in found if one is not None]
+                trials += filter(None, found)
     return num_windows, trials[:most]
 
 
-async def _try_each(window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary) -> list[Trial] | None:
-    """Return a trial of each strategy; None if the free answer is not in conflict or an answer is missing."""
-    found: list[Trial] = []
+async def _try_each(window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary) -> list[Trial]:
+    """Return a trial of each strategy; none if the free answer is not in conflict or an answer is missing."""
+    trials: list[Trial] = []
     with contextlib.suppress(NoAnswer):
         for strategy in STRATEGIES:
-            trial = await try_strategy(window, teacher, cfg, vocabulary, strategy)
-            if trial is None:
-                break
-            found.append(trial)
-    return found if len(found) == len(STRATEGIES) else None
+            if (trial := await try_strategy(window, teacher, cfg, vocabulary, strategy)) is None:
+                return []
+            trials.append(trial)
+    return trials if len(trials) == len(STRATEGIES) else []
 
 
 COLUMNS = ("strategy", "repaired", "consistency", "naturalness", "requests each", "tokens each")

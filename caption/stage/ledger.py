@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
-from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -189,19 +188,19 @@ class SampleCards:
     """Samples captions of every kind for the page: those of the smallest hash, in whatever order they come."""
 
     def __init__(self) -> None:
-        self._kinds: dict[str, list[tuple[str, str, Caption]]] = {}
+        self._kinds: dict[str, list[Caption]] = {}
 
     def add(self, caption: Caption) -> None:
         kind = "dropped" if caption.status == "dropped" else "repaired" if caption.repair else str(caption.verdict)
         cards = self._kinds.setdefault(kind, [])
-        cards.append((sha256_bytes(caption.sample_id.encode())[:16], caption.sample_id, caption))
-        cards.sort(key=itemgetter(0, 1))
+        cards.append(caption)
+        cards.sort(key=lambda card: sha256_bytes(card.sample_id.encode()))
         del cards[NUM_CARDS:]
 
     def chosen(self) -> list[Caption]:
         """Return up to NUM_CARDS captions, the kinds in turn, sorted by id."""
         turns = zip_longest(*(self._kinds[kind] for kind in sorted(self._kinds)))
-        captions = [card[2] for turn in turns for card in turn if card is not None]
+        captions = [card for turn in turns for card in turn if card is not None]
         return sorted(captions[:NUM_CARDS], key=lambda caption: caption.sample_id)
 
 

@@ -96,21 +96,12 @@ def _values(shown: ReleasedTrack, frames: tuple[ObservedFrame, ...], caption: Sh
     observed = observe(shown.flight, frames, slice(window[0], window[-1] + 1), _order_of(caption))
     facts = measure_facts(observed, caption.picture_px)  # type: ignore[arg-type]
     for language, counts in caption.values.items():
-        if all(count is None for count in counts):
-            continue  # not counted
-        told = Coc(**caption.texts[language])
-        yield from _of_language(caption, told, evidence, facts, language, counts)
+        if any(count is not None for count in counts):  # otherwise they were not counted
+            yield from _of_language(caption, evidence, facts, language)
 
 
-def _of_language(
-    caption: ShownCaption,
-    told: Coc,
-    evidence: Evidence,
-    facts: Facts,
-    language: Language,
-    counts: tuple[int | None, ...],
-) -> Iterator[Mismatch]:
-    where = f"{caption.sample_id}: caption_{language}"
+def _of_language(caption: ShownCaption, evidence: Evidence, facts: Facts, language: Language) -> Iterator[Mismatch]:
+    where, told = f"{caption.sample_id}: caption_{language}", Coc(**caption.texts[language])
     template = (evidence.slots or {}).get(language)
     if template is None:
         draft = FORMATS["prose"].read(told, facts)
@@ -123,6 +114,7 @@ def _of_language(
         names = [name for name in vars(told) if getattr(told, name) != getattr(draft.coc, name)]
         yield "values", f"{where}_{names[0]}", getattr(told, names[0]), getattr(draft.coc, names[0])
         return
+    counts = caption.values[language]
     found = check_values(draft.outside, facts, language, draft.num_filled).counts
     if (expected := tuple(vars(found).values())) != counts:
         yield "values", where, f"filled, matched, contradicted {counts}", f"{expected}, by the points of the window"

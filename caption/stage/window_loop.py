@@ -262,10 +262,7 @@ class _WindowLoop:
 
     def _accept(self, draft: Draft, question: Question) -> None:
         self.drafts["en"], self.answered = draft, question
-        self.caption.verdict = self._verdict_of(draft)
-
-    def _verdict_of(self, draft: Draft) -> Verdict:
-        return verdict_on(draft.coc.flight_decision, self.label, self.contradicted)
+        self.caption.verdict = verdict_on(draft.coc.flight_decision, self.label, self.contradicted)
 
     # --- regeneration ---
 
@@ -335,7 +332,8 @@ class _WindowLoop:
                 if answer.reason == CONTEXT_FULL:
                     return CONTEXT_FULL  # not a failure of the teacher
                 continue
-            verdict, decision = self._verdict_of(answer), answer.coc.flight_decision
+            decision = answer.coc.flight_decision
+            verdict = verdict_on(decision, self.label, self.contradicted)
             is_accepted = cfg.treatment_of(verdict) == "keep" and decision != rejected
             if asked.decision is not None:
                 is_accepted = is_accepted and decision == asked.decision

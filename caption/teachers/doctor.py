@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -72,7 +72,8 @@ def examine_endpoint(
         TeacherError: The URL cannot be asked.
     """
     with progress_bar("doctor", NUM_REQUESTS) as advance:
-        examination = _Examination(ChatClient(url, cfg.endpoint), cfg, vocabulary, advance, most_requests)
+        largest = largest_messages(cfg, vocabulary)
+        examination = _Examination(ChatClient(url, cfg.endpoint), cfg, largest, advance, most_requests)
         return run_until_interrupted(examination.run(), keeps_work=False)
 
 
@@ -80,19 +81,15 @@ class _LimitReached(Exception):
     """The examination has sent as many requests as it may."""
 
 
+@dataclass
 class _Examination:
-    def __init__(
-        self,
-        client: ChatClient,
-        cfg: CaptionConfig,
-        vocabulary: Vocabulary,
-        advance: Advance,
-        most_requests: int | None,
-    ) -> None:
-        self.client, self.cfg, self.advance = client, cfg, advance
-        self.num_requests, self.most_requests = 0, most_requests
-        self.largest = largest_messages(cfg, vocabulary)
-        self.findings: list[Finding] = []
+    client: ChatClient
+    cfg: CaptionConfig
+    largest: list[dict]  # messages as long as ours get
+    advance: Advance
+    most_requests: int | None
+    num_requests: int = 0
+    findings: list[Finding] = field(default_factory=list)
 
     async def run(self) -> list[Finding]:
         try:
