@@ -8,8 +8,8 @@ from specimens_captions import VOCABULARY
 from tables import each
 
 from caption.schema import CaptionConfig, RepairConfig, WindowConfig
-from caption.stage.compare import compare, comparison_rows
-from caption.stage.window_loop import Trial, caption_window, try_strategy
+from caption.stage.compare import Trial, compare, comparison_rows, try_strategy
+from caption.stage.window_loop import caption_window
 from caption.stage.windows import cut_windows
 from caption.teachers.teacher import RuleTeacher
 from cosfly.formats.captions import Caption, Coc

@@ -19,10 +19,10 @@ from typing import get_args
 from caption.schema import CaptionConfig, Strategy, Window
 from caption.stage.asking import ANSWERS
 from caption.stage.tracks import find_inputs
-from caption.stage.window_loop import Trial, try_strategy
+from caption.stage.window_loop import WindowLoop
 from caption.teachers.prompt_files import Vocabulary, vocabulary_of
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
-from cosfly.formats.captions import Coc
+from cosfly.formats.captions import Coc, Verdict
 from cosfly.llm.answers import AnswerBook
 from cosfly.llm.contract import NoAnswer, run_until_interrupted
 from cosfly.runtime.errors import ConfigError, InputError
@@ -31,6 +31,17 @@ from cosfly.runtime.json_io import write_json
 
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 RESULT = "compare_strategies.json"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One conflict and its regeneration by a strategy, without the mirror. last: None if it failed."""
+
+    first: Coc
+    last: Coc | None
+    verdict: Verdict | None
+    asks: int
+    tokens: int
 
 
 @dataclass(frozen=True)
@@ -120,13 +131,30 @@ async def _try_all(
 
 async def _try_each(window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary) -> list[Trial]:
     """Return a trial of each strategy; none if the free answer is not in conflict or an answer is missing."""
-    trials: list[Trial] = []
     with contextlib.suppress(NoAnswer):
-        for strategy in STRATEGIES:
-            if (trial := await try_strategy(window, teacher, cfg, vocabulary, strategy)) is None:
-                return []
-            trials.append(trial)
-    return trials if len(trials) == len(STRATEGIES) else []
+        trials = [await try_strategy(window, teacher, cfg, vocabulary, strategy) for strategy in STRATEGIES]
+        return [trial for trial in trials if trial is not None]
+    return []
+
+
+async def try_strategy(
+    window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary, strategy: Strategy
+) -> Trial | None:
+    """Repair the first answer of a window by a strategy; None if it is not rejected. NoAnswer: There is none."""
+    repair = cfg.repair.model_copy(update={"strategy": strategy})
+    loop = WindowLoop(window, teacher, cfg.model_copy(update={"repair": repair}), vocabulary)
+    reason = await loop.ask_freely(loop.answered)
+    if reason is not None or repair.treatment_of(loop.caption.verdict) == "keep" or loop.label is None:
+        return None
+    first, num_asks, tokens = loop.english.coc, loop.caption.attempts, loop.caption.usage.total
+    try:
+        reason = await loop.regenerate(loop.answered)
+    except NoAnswer as error:  # a teacher without a reason for the label has not repaired the conflict
+        if not error.is_final:
+            raise
+        reason = error.cause
+    last, caption = loop.english.coc if reason is None else None, loop.caption
+    return Trial(first, last, caption.verdict, caption.attempts - num_asks, caption.usage.total - tokens)
 
 
 COLUMNS = ("strategy", "repaired", "consistency", "naturalness", "requests each", "tokens each")

@@ -23,22 +23,19 @@ from cosfly.viz.page import page
 NUM_CARDS = 24
 # The codes of `drop_reason` and their meanings, for messages and docs/captions.md.
 REASONS = {
-    "order_to_come": "the mission's order comes in the window's future and is not known in an observed frame; the "
-    "teacher is not asked",
+    "order_to_come": "the order of a mission comes in the window's future; the teacher is not asked",
     "unusable_frame": "a picture of the window is missing or cannot be read; see `checks.frame`",
     "refused": "the server or engine refused the request; see `checks.refusal`",
     "declined": "the model declined to answer; see `checks.refusal`",
     "not_in_file": "the file of captions or predictions has none for this window",
     "structure": "no answer had the requested fields; see `checks.structure`",
     "context_full": "prompt and answer fill the server's context: raise it, or send smaller pictures",
-    "conflict": "the decision is in conflict with the trajectory (see `verdict`), and the settings or a given caption "
-    "exclude a regeneration",
+    "conflict": "the decision is in conflict with the trajectory (see `verdict`), and it is not asked again",
     "no_label": "the decision is in conflict, and geometry has no label to anchor a regeneration to",
     "regeneration_failed": "no answer of caption.repair.max_asks asks had a decision without conflict",
     "decision_mismatch": "the reasoning leads to another action than the decision",
     "contradicted_value": "a number of the text contradicts the measured facts; see `checks.contradictions`",
-    "invalid_slot": "a slot names nothing, an unknown fact or an unobserved frame, or its braces, unit or side do not "
-    "fit",
+    "invalid_slot": "a slot names no known fact of the window, or its braces, unit or side do not fit",
     "no_reason": "no observed fact supports the given decision",
     "bilingual": "the two languages do not say the same; see `checks.bilingual`",
 }

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -177,12 +178,13 @@ def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Res
 
 def _has_more(stage: StageFolder, cfg: CaptionConfig, retry_failed: bool) -> bool:
     """Return whether a complete directory is continued: its limit was smaller, or refused windows are asked again."""
-    manifest, refused = read_manifest(stage.path), read_quarantine(stage.path) if retry_failed else {}
+    manifest, wanted = read_manifest(stage.path), cfg.limit or math.inf
     limit = manifest.facts.get("limit")
-    is_larger = limit is not None and (cfg.limit is None or cfg.limit > limit)
-    if not (is_larger or refused):
+    if limit is not None and wanted > limit:
+        return True
+    if not (retry_failed and read_quarantine(stage.path)):
         return False
-    if not is_larger and cfg.limit is not None and cfg.limit < manifest.counts.input:
+    if wanted < manifest.counts.input:
         raise ResumeError(
             "the directory contains more windows than the limit allows, so it is not changed", where=stage.path,
             got=f"{manifest.counts.input} windows", expected=f"at most {cfg.limit} (caption.limit)",

@@ -87,25 +87,18 @@ def _outcome(caption: Caption) -> Iterator[str]:
 
 
 def _exchange(number: int, request: Request, reply: Reply) -> Iterator[str]:
-    """Yield the lines of a question and its answer."""
+    """Yield the lines of a question and its answer; a picture is its number and size."""
     for message in request.messages:
         yield f"--- request {number}, {message['role']} ---"
-        yield from _text_of(message["content"])
+        content, num_pictures = message["content"], 0
+        parts: list[dict] = [{"type": "text", "text": content}] if isinstance(content, str) else content
+        for part in parts:
+            if part["type"] == "text":
+                yield for_terminal(part["text"], LONGEST_LOG)
+            else:
+                num_pictures += 1
+                yield f"[picture {num_pictures}, {len(part['image_url']['url']) / 1e3:.0f} kB]"
     usage = reply.usage
     tokens = f"{usage.prompt_tokens} tokens in, {usage.completion_tokens} out" if usage else "tokens not reported"
     yield f"--- answer {number} ({tokens}) ---"
     yield for_terminal(reply.text, LONGEST_LOG)
-
-
-def _text_of(content: str | list[dict]) -> Iterator[str]:
-    """Yield the lines of a message; a picture is its number and size."""
-    if isinstance(content, str):
-        yield for_terminal(content, LONGEST_LOG)
-        return
-    num_pictures = 0
-    for part in content:
-        if part["type"] == "text":
-            yield for_terminal(part["text"], LONGEST_LOG)
-        else:
-            num_pictures += 1
-            yield f"[picture {num_pictures}, {len(part['image_url']['url']) / 1e3:.0f} kB]"

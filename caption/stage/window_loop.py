@@ -6,10 +6,10 @@ that the trajectory contradicts is asked for again, by default anchored to the l
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from caption.answer_formats.formats import THEREFORE, Draft, Refused
-from caption.schema import CaptionConfig, Strategy, Window
+from caption.schema import CaptionConfig, Window
 from caption.stage.ledger import REASONS
 from caption.teachers.judge import Conflict, Judge
 from caption.teachers.prompt_files import Vocabulary
@@ -17,17 +17,7 @@ from caption.teachers.prompts import Correction, Question, make_question, prompt
 from caption.teachers.teacher import Teacher
 from caption.verification.actions import TABLE, measure
 from caption.verification.values import check_values, measured_lines
-from cosfly.formats.captions import (
-    ACTIONS,
-    Caption,
-    Checks,
-    Coc,
-    Language,
-    RepairRecord,
-    Usage,
-    Verdict,
-    verdict_on,
-)
+from cosfly.formats.captions import ACTIONS, Caption, Checks, Language, RepairRecord, Usage, verdict_on
 from cosfly.llm.answer_text import Parsed, parse_answer
 from cosfly.llm.contract import NoAnswer, Reply
 from cosfly.runtime.errors import InputError, RenderError
@@ -51,7 +41,7 @@ async def caption_window(
     Raises:
         NoAnswer: The teacher gave none, but may later. TeacherError: No window will get an answer.
     """
-    loop = _WindowLoop(window, teacher, cfg, vocabulary, judge)
+    loop = WindowLoop(window, teacher, cfg, vocabulary, judge)
     reason = window.problem
     if reason is None:
         try:
@@ -69,38 +59,7 @@ async def caption_window(
     return loop.finish(reason)
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One conflict and its regeneration by a strategy, without the mirror. last: None if it failed."""
-
-    first: Coc
-    last: Coc | None
-    verdict: Verdict | None
-    asks: int
-    tokens: int
-
-
-async def try_strategy(
-    window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary, strategy: Strategy
-) -> Trial | None:
-    """Repair the first answer of a window by a strategy; None if it is not rejected. NoAnswer: There is none."""
-    repair = cfg.repair.model_copy(update={"strategy": strategy})
-    loop = _WindowLoop(window, teacher, cfg.model_copy(update={"repair": repair}), vocabulary)
-    reason = await loop.ask_freely(loop.answered)
-    if reason is not None or repair.treatment_of(loop.caption.verdict) == "keep" or loop.label is None:
-        return None
-    first, num_asks, tokens = loop.english.coc, loop.caption.attempts, loop.caption.usage.total
-    try:
-        reason = await loop.regenerate(loop.answered)
-    except NoAnswer as error:  # a teacher without a reason for the label has not repaired the conflict
-        if not error.is_final:
-            raise
-        reason = error.cause
-    last, caption = loop.english.coc if reason is None else None, loop.caption
-    return Trial(first, last, caption.verdict, caption.attempts - num_asks, caption.usage.total - tokens)
-
-
-class _WindowLoop:
+class WindowLoop:
     """The asks of one window and their results.
 
     caption: Its record so far. drafts: The answers that were accepted; a Chinese one may have been refused.

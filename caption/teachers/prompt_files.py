@@ -111,8 +111,7 @@ def export_prompts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
         folder.mkdir(parents=True, exist_ok=True)
     refuse_links(folder)
     paths = {folder / f"{name}{SUFFIX}": text for name, text in texts.items()}
-    kept = [path for path in paths if path.exists()]
-    others = [path.name for path in kept if not path.is_file() or read_text(path) != paths[path]]
+    others = [path.name for path, text in paths.items() if path.exists() and read_text(path) != text]
     if others:
         what, fix = "the folder already contains prompts with a different text", "choose another folder"
         raise ConfigError(what, where=folder, got=", ".join(others), fix=fix)

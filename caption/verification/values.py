@@ -8,8 +8,8 @@ count. A number that matches none is contradicted. Words are not checked, and ne
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 from caption.verification.facts import Facts, Series, wrapped
 from caption.verification.glossary import ends_of_clauses, mentioned, mentions
@@ -25,19 +25,11 @@ FOREIGN_SHARE = 0.03  # of a number in another unit than ours, which its writer 
 DIGITS = {"m": 1, "mps": 2, "deg": 1, "dps": 1, "px": 0}  # with which facts are printed; other units are not compared
 
 
-@dataclass(frozen=True)
-class ValueCheck:
+class ValueCheck(NamedTuple):
     """The values of one text. contradictions: a message for each contradicted value."""
 
-    filled: int = 0
-    matched: int = 0
-    contradictions: tuple[str, ...] = ()
-
-    @property
-    def counts(self) -> ValueCounts:
-        return ValueCounts(
-            values_filled=self.filled, values_matched=self.matched, values_contradicted=len(self.contradictions)
-        )
+    counts: ValueCounts
+    contradictions: list[str]
 
 
 def check_values(sentences: Sequence[str], facts: Facts, language: Language, filled: int = 0) -> ValueCheck:
@@ -64,7 +56,8 @@ def check_values(sentences: Sequence[str], facts: Facts, language: Language, fil
                 contradictions.append(
                     f'number: "{numeral.text.strip()}" in "{clause.strip()[:SHOWN]}" is no measured {of} of the window'
                 )
-    return ValueCheck(filled, matched, tuple(contradictions))
+    counts = ValueCounts(values_filled=filled, values_matched=matched, values_contradicted=len(contradictions))
+    return ValueCheck(counts, contradictions)
 
 
 def _clause_around(sentence: str, numeral: Numeral, language: Language) -> str:
