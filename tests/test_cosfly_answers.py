@@ -17,6 +17,7 @@ from cosfly.formats.captions import TOKENS, Coc, read_captions, write_captions
 from cosfly.llm.answer_text import answer_schema, normalize_action, parse_answer
 from cosfly.llm.contract import Reply
 from cosfly.llm.protocol import BadReply, Response, error_words, read_body, read_completion, read_models
+from cosfly.llm.refusals import Refusal
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.model_json import find_object
 
@@ -42,7 +43,7 @@ def changed(**fields: object) -> str:
 def completed(body: bytes) -> Reply | str:
     try:
         return read_completion(Response(200, body), "plain")
-    except BadReply as problem:
+    except (BadReply, Refusal) as problem:
         return str(problem)
 
 

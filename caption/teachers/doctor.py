@@ -106,7 +106,7 @@ class _Examination:
         finally:
             await self.client.close()
         if refusal := self.client.left_out.get("no_system"):
-            self._add("system role", "warning", LEFT_OUT["no_system"] % refusal.summary)
+            self._add("system role", "warning", LEFT_OUT["no_system"] % refusal)
         return self.findings
 
     def _add(self, name: str, state: State, detail: str) -> None:
@@ -124,7 +124,7 @@ class _Examination:
         except (TimeoutError, httpx.RequestError) as error:
             return self.client.message_of(error)
         except Refusal as refusal:
-            return refusal.summary + ("" if refusal.kind == "unknown" else f"; {refusal.meaning.fix}")
+            return str(refusal) + ("" if refusal.kind == "unknown" else f"; {refusal.meaning.fix}")
         except BadReply as error:
             return str(error)
 
@@ -145,7 +145,7 @@ class _Examination:
         reply = await self._ask([_user("Hello! How are you today?")], 256, ODD_SCHEMA)
         plain = "so answers are parsed from plain text"
         if refusal := self.client.left_out.get("schema"):
-            self._add("JSON schema", "warning", f"refused, {plain}: {refusal.summary}; {refusal.meaning.fix}")
+            self._add("JSON schema", "warning", f"refused, {plain}: {refusal}; {refusal.meaning.fix}")
             return
         if isinstance(reply, str):
             self._add("JSON schema", "warning", f"not tested: {reply}")

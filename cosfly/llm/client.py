@@ -24,8 +24,8 @@ from pydantic import Field
 
 from cosfly.llm import protocol
 from cosfly.llm.contract import NoAnswer, Reply, Request, Troubles
-from cosfly.llm.protocol import KEY_VARIABLE, BadReply, Response
-from cosfly.llm.refusals import MEANINGS, Kind, Refusal, kind_of
+from cosfly.llm.protocol import BadReply, Response
+from cosfly.llm.refusals import KEY_VARIABLE, MEANINGS, Kind, Refusal
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import TeacherError
 from cosfly.runtime.model_json import CONTEXT_FULL
@@ -246,14 +246,17 @@ class ChatClient:
             response = await self._exchange("chat/completions", body)
             try:
                 return self._read(response, "json_schema" if with_schema else "plain")
+            except BadReply as error:
+                raise BadReply(self._clean(str(error))) from None
             except Refusal as refusal:
+                refusal.message = self._clean(refusal.message)
                 has_system = with_system and request.messages[0]["role"] == "system"
                 if not {"schema": with_schema, "no_system": has_system}.get(refusal.kind):
                     if refusal.kind == "num_images":
                         refusal.message += f" (the request has {len(body) / 1e6:.1f} MB)"
                     raise
                 self.left_out[refusal.kind] = refusal
-                self._tell_once(refusal.kind, logging.WARNING, LEFT_OUT[refusal.kind] % refusal.summary)
+                self._tell_once(refusal.kind, logging.WARNING, LEFT_OUT[refusal.kind] % refusal)
 
     def _tell_once(self, topic: str, level: int, message: str) -> None:
         """Write a line about a topic to the log, once."""
@@ -264,18 +267,18 @@ class ChatClient:
     def _refused(self, refusal: Refusal, sent_s: float) -> NoAnswer | TeacherError:
         """Return the error of a refused request: NoAnswer for this try or this request, TeacherError for all."""
         if refusal.meaning.ends_run:
-            return self._error(refusal.meaning.what, got=refusal.summary, fix=refusal.meaning.fix)
+            return self._error(refusal.meaning.what, got=str(refusal), fix=refusal.meaning.fix)
         if refusal.may_pass:
             if refusal.is_loading:
-                return NoAnswer(LOADING, refusal.summary, wait_s=LOADING_PAUSE_S)
+                return NoAnswer(LOADING, str(refusal), wait_s=LOADING_PAUSE_S)
             # A longer wait ends this request, but does not delay the others.
             wait_s = refusal.wait_s
             is_long = wait_s is not None and wait_s > TOTAL_TIMEOUT_S
             if refusal.status in BUSY_STATUS:
                 self.concurrency.was_busy(sent_s, None if is_long else wait_s)
             asked = f" (the server asks to wait {wait_s:.0f} s)" if is_long else ""
-            return NoAnswer(f"http_{refusal.status}", refusal.summary + asked, wait_s=wait_s)
-        return NoAnswer(refusal.code, refusal.summary, fix=refusal.meaning.fix, is_final=True)
+            return NoAnswer(f"http_{refusal.status}", f"{refusal}{asked}", wait_s=wait_s)
+        return NoAnswer(refusal.code, str(refusal), fix=refusal.meaning.fix, is_final=True)
 
     def _with_full_context(self, reply: Reply, request: Request) -> Reply:
         """Mark an answer that the server cut before `max_tokens` because its context is full.
@@ -317,11 +320,12 @@ class ChatClient:
             except (TimeoutError, httpx.RequestError) as error:
                 fix = "start the server, or correct its address"
                 raise self._error("cannot reach the teacher", got=self.message_of(error), fix=fix) from None
-            refusal = self._refusal(response)
+            refusal = protocol.read_refusal(response)
+            refusal.message = self._clean(refusal.message)
             if response.status == 200 or not refusal.is_loading or time.monotonic() > deadline_s:
                 break
-            if self.troubles.failed(refusal.summary):
-                log.warning("%s: %s; waiting for the server", self.where, refusal.summary)
+            if self.troubles.failed(str(refusal)):
+                log.warning("%s: %s; waiting for the server", self.where, str(refusal))
             await asyncio.sleep(LOADING_PAUSE_S)
         if response.status in (401, 403):
             raise self._refused(refusal, 0.0)
@@ -335,7 +339,7 @@ class ChatClient:
             self.model = wanted  # some hosts list no models; the first request shows whether it exists
         elif entries is None:
             what = "the server does not return a list of models, so it may not be an OpenAI-compatible endpoint"
-            raise self._error(what, got=refusal.summary, fix="correct the URL, or pass --model")
+            raise self._error(what, got=str(refusal), fix="correct the URL, or pass --model")
         elif not names:
             raise self._error("the endpoint lists no model with a usable name", fix="pass --model")
         else:
@@ -346,30 +350,12 @@ class ChatClient:
     # --- responses ---
 
     def _read(self, response: Response, structured: str) -> Reply:
-        """Return the reply in a response; raises Refusal, which some servers send with status 200, or BadReply."""
+        """Return the reply in a response; raises Refusal or BadReply."""
         if response.status != 200:
-            raise self._refusal(response)
+            raise protocol.read_refusal(response)
         if response.is_cut:
             raise BadReply(f"the response is longer than {MOST_REPLY_MB:g} MB")
-        try:
-            return protocol.read_completion(response, structured)
-        except BadReply as error:
-            problem, status = str(error), error.status
-        kind = kind_of(status, problem) if status else "unknown"
-        refusal = Refusal(status or 200, kind, self._clean(problem), response.retry_after_s)
-        if kind == "unknown" and not refusal.may_pass:
-            raise BadReply(refusal.message)
-        raise refusal
-
-    def _refusal(self, response: Response) -> Refusal:
-        """Return the refusal in a response whose status is not 200."""
-        text = response.body.decode("utf-8", "replace")  # the charset in the header is ignored
-        try:
-            message = protocol.error_words(protocol.read_body(response.body))
-        except ValueError:
-            message = text
-        kind = kind_of(response.status, text)
-        return Refusal(response.status, kind, self._clean(message), response.retry_after_s)
+        return protocol.read_completion(response, structured)
 
     def _error(self, what: str, **parts: Any) -> TeacherError:
         return TeacherError(what, where=self.where, **parts)

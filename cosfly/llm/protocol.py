@@ -13,10 +13,10 @@ from pydantic_core import to_json
 
 from cosfly.formats.captions import Usage
 from cosfly.llm.contract import MOST_TOKENS, Reply, Request
+from cosfly.llm.refusals import KEY_VARIABLE, Refusal, kind_of
 from cosfly.runtime.escaping import without_keys
 from cosfly.runtime.model_json import DECLINED
 
-KEY_VARIABLE = "COSFLY_API_KEY"
 THOUGHT_FIELDS = ("reasoning_content", "reasoning", "thinking", "reasoning_details")  # of a message
 MESSAGE_FIELDS = ("message", "msg", "detail")  # of an error
 EVENT_STARTS = (b"data:", b"event:", b"id:", b"retry:", b":")  # of a stream of server-sent events
@@ -99,11 +99,7 @@ class Response:
 
 
 class BadReply(Exception):
-    """A response with status 200 that holds no usable reply. status: Of the error that it holds instead, if it does."""
-
-    def __init__(self, problem: str, status: int | None = None) -> None:
-        super().__init__(problem)
-        self.status = status
+    """A response with status 200 that holds no usable reply."""
 
 
 def read_body(content: bytes) -> Any:
@@ -173,29 +169,47 @@ def error_words(value: Any) -> str:
     return str(next((error[name] for name in MESSAGE_FIELDS if error.get(name)), error))
 
 
-def _error_status(value: dict[str, Any]) -> int:
-    """Return the status that an error in a response of status 200 gives as its code; 200 if it gives none."""
+def read_refusal(response: Response) -> Refusal:
+    """Return the refusal in a response whose status is not 200."""
+    text = response.body.decode("utf-8", "replace")  # the charset in the header is ignored
+    try:
+        message = error_words(read_body(response.body))
+    except ValueError:
+        message = text
+    return Refusal(response.status, kind_of(response.status, text), message, response.retry_after_s)
+
+
+def _error_instead(value: dict[str, Any], wait_s: float | None) -> Refusal | BadReply:
+    """Return the refusal in a response of status 200, a BadReply if its cause is not known.
+
+    An error may give its status as its code.
+    """
     error = value.get("error")
     code = str((error if isinstance(error, dict) else value).get("code"))
-    return int(code) if re.fullmatch("[45][0-9]{2}", code) else 200
+    status = int(code) if re.fullmatch("[45][0-9]{2}", code) else 200
+    problem = f"the server sent an error instead of an answer: {error_words(value)}"
+    refusal = Refusal(status, kind_of(status, problem), problem, wait_s)
+    return refusal if refusal.kind != "unknown" or refusal.may_pass else BadReply(problem)
 
 
 def read_completion(response: Response, structured: str) -> Reply:
-    """Return the reply in a response; BadReply if a type or a size is wrong. structured: As in `Reply`."""
-    value = _object(response)
+    """Return the reply in a response; structured: As in `Reply`.
+
+    Raises:
+        BadReply: A type or a size is wrong. Refusal: Some servers send one with status 200.
+    """
+    value, wait_s = _object(response), response.retry_after_s
     if value is None:
         raise BadReply("the response is not JSON")
     choices = value.get("choices")
     if not isinstance(choices, list) or not choices or not isinstance(choices[0], dict):
         if any(value.get(name) for name in ("error", *MESSAGE_FIELDS)):
-            raise _error_instead(value)
+            raise _error_instead(value, wait_s)
         raise BadReply("the response has no choices")
     choice = choices[0]
     finish_reason = choice.get("finish_reason")
-    if choice.get("error"):
-        raise _error_instead(choice)
-    if finish_reason in ENDED:
-        raise _error_instead({"error": finish_reason})
+    if choice.get("error") or finish_reason in ENDED:
+        raise _error_instead(choice if choice.get("error") else {"error": finish_reason}, wait_s)
     message = choice["message"] if isinstance(choice.get("message"), dict) else {}
     text, usage = _final_text(message), _usage(value.get("usage"))
     refusal = message.get("refusal")
@@ -205,13 +219,8 @@ def read_completion(response: Response, structured: str) -> Reply:
         text = ""  # thoughts that the server does not return took all tokens
     if text is None:
         raise BadReply("the message has no text")
-    thoughts = max(len(thought) for name in THOUGHT_FIELDS if isinstance(thought := message.get(name, ""), str))
-    return Reply(text, usage, structured, _name(finish_reason), num_thoughts=thoughts)
-
-
-def _error_instead(value: dict[str, Any]) -> BadReply:
-    problem = f"the server sent an error instead of an answer: {error_words(value)}"
-    return BadReply(problem, _error_status(value))
+    thoughts = [len(message[name]) for name in THOUGHT_FIELDS if isinstance(message.get(name), str)]
+    return Reply(text, usage, structured, _name(finish_reason), num_thoughts=max(thoughts, default=0))
 
 
 def _name(value: Any) -> str | None:

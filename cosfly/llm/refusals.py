@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from cosfly.llm.protocol import KEY_VARIABLE
 from cosfly.runtime.config import read_yaml
 
 Kind = Literal[
     "account", "too_long", "num_images", "no_vision", "no_system", "schema", "parameter", "content", "unknown"
 ]
 
+KEY_VARIABLE = "COSFLY_API_KEY"
 MOST_CHARACTERS = 4000  # of a text that are searched: some servers echo the request
 NEVER = "$^"  # a pattern that matches nothing
 
@@ -65,7 +65,7 @@ class Refusal(Exception):
     """A request that a server refused.
 
     message: the server's text, short, in one line, without the key. wait_s: how long the server asks to wait, if it
-    does. code: the cause, as tallies count it. summary: status and message. may_pass: whether the same request may be
+    does. code: the cause, as tallies count it. may_pass: whether the same request may be
     answered later, because the server is busy, away or broken.
     """
 
@@ -78,8 +78,7 @@ class Refusal(Exception):
     def code(self) -> str:
         return f"refused_{self.status if self.kind == 'unknown' else self.kind}"
 
-    @property
-    def summary(self) -> str:
+    def __str__(self) -> str:
         return f"HTTP {self.status} {self.message}".rstrip()
 
     @property
