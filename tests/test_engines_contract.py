@@ -150,7 +150,7 @@ def test_an_engine_is_closed_whatever_came_of_its_start():
 
 def test_the_engine_of_the_recipe_captions_a_flight(tree, tmp_path: Path, monkeypatch):
     engine = PlainEngine()
-    monkeypatch.setattr(teacher, "make_engine", lambda cfg, troubles: engine)
+    monkeypatch.setattr(teacher, "make_engine", lambda cfg: engine)
     monkeypatch.setattr(window_loop, "MIRROR_ASKS", 1)
     cfg = settings("http://plain")
     captions = list(read_captions(run(cfg, tree, tmp_path / "out")))

@@ -24,10 +24,9 @@ from caption.teachers.teacher import Teacher, first_budget, open_teacher
 from cosfly.formats.captions import Caption, Usage, read_captions, write_captions
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook, Budget, BudgetSpent
-from cosfly.llm.contract import STOP_AFTER_FAILURES, NoAnswer, Troubles
+from cosfly.llm.contract import STOP_AFTER_FAILURES, NoAnswer
 from cosfly.runtime.console import SECONDS_BETWEEN_LINES, Advance, duration, progress_bar
 from cosfly.runtime.errors import CosflyError, InputError, TeacherError
-from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.run_dir import Failed, StageFolder, Tally, read_failures, write_failures
 
 log = logging.getLogger(__name__)
@@ -78,21 +77,21 @@ class Asking:
         Raises:
             TeacherError: No window would get an answer. Earlier answers are kept.
         """
-        path, troubles = self.stage.path, Troubles()
+        path = self.stage.path
         guesses = [track.guess_num_windows(self.cfg.window) for track in tracks]
         try:
             with AnswerBook(path / ANSWERS) as answers, AnswerBook(path / JUDGEMENTS) as judgements:
                 self.books = (answers, judgements)
                 budget = first_budget(self.cfg, answers.totals, judgements.totals)
                 with progress_bar("caption", sum(guesses)) as advance:
-                    self.progress = RunProgress(advance, sum(guesses), budget, troubles)
+                    self.progress = RunProgress(advance, sum(guesses), budget)
                     async with (
-                        open_teacher(self.cfg, answers, self.seed, budget, self.retried, troubles) as teacher,
-                        open_judge(self.cfg.judge, self.vocabulary, self.seed, judgements, budget, troubles) as judge,
+                        open_teacher(self.cfg, answers, self.seed, budget, self.retried) as teacher,
+                        open_judge(self.cfg.judge, self.vocabulary, self.seed, judgements, budget) as judge,
                     ):
                         self.judge = judge
                         await self._ask_all(tracks, guesses, teacher)
-                if self.progress.windows.input or troubles.num:
+                if self.progress.windows.input:
                     log.info("caption: %s", self.progress.figures())
                 if judgements.totals:
                     self.outcome.judge_usage = Usage(**{name: judgements.totals[name] for name in Usage.model_fields})
@@ -269,8 +268,8 @@ def common_causes(failures: list[Failed]) -> str:
 class RunProgress:
     """Counts the outcomes of windows and moves the progress bar."""
 
-    def __init__(self, advance: Advance, total: int, budget: Budget, troubles: Troubles) -> None:
-        self._advance, self.num_left, self.budget, self.troubles = advance, total, budget, troubles
+    def __init__(self, advance: Advance, total: int, budget: Budget) -> None:
+        self._advance, self.num_left, self.budget = advance, total, budget
         self.windows = Tally()  # of this run
         self.num_repaired = 0
         self._start_s = time.monotonic()
@@ -301,7 +300,7 @@ class RunProgress:
 
     def figures(self) -> str:
         """Return the figures of the run as a text."""
-        budget, troubles, windows = self.budget, self.troubles, self.windows
+        budget, windows = self.budget, self.windows
         tokens = Counter(budget.totals)
         tokens.subtract(self._tokens_before)
         reasons = ", ".join(f"{reason} {count}" for reason, count in windows.dropped.most_common(4))
@@ -317,8 +316,4 @@ class RunProgress:
             figures.append(f"cost {budget.spent - self._spent_before:.2f}")
         if windows.input:
             figures.append(f"{duration(self.num_left / rate_per_s)} left")
-        if troubles.num:
-            figures.append(f"{troubles.num:,} failed attempts")
-        if troubles.last is not None:
-            figures.append(f"no answer for {duration(troubles.silent_s)}, the last: {for_terminal(troubles.last)}")
         return ", ".join(figures)

@@ -20,7 +20,7 @@ from cosfly.formats.captions import Coc, JudgeRecord
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook, Budget, KeptAnswers
 from cosfly.llm.client import ChatClient, EndpointConfig
-from cosfly.llm.contract import NoAnswer, Request, Troubles, started
+from cosfly.llm.contract import NoAnswer, Request, started
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.io import read_unpacked
 from cosfly.runtime.json_io import Record, dump_json, parse_document, validated
@@ -110,18 +110,17 @@ async def open_judge(
     seed: int,
     book: AnswerBook | None = None,
     budget: Budget | None = None,
-    troubles: Troubles | None = None,
 ) -> AsyncIterator[Judge | None]:
     """Connect to the judge of the settings; None if they name none.
 
     Args:
-        book: Journal of the answers. budget: None sets no limit. troubles: Records failed tries.
+        book: Journal of the answers. budget: None sets no limit.
     """
     if cfg.url is None:
         yield None
         return
     endpoint = EndpointConfig(model=cfg.model, concurrency=cfg.concurrency, max_tries=MAX_TRIES)
-    client = ChatClient(cfg.url, endpoint, troubles)
+    client = ChatClient(cfg.url, endpoint)
     async with started(client):
         yield Judge(KeptAnswers(client, book, budget), cfg, vocabulary, seed)
 

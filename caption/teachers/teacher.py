@@ -29,7 +29,7 @@ from cosfly.formats.places import flight_of
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.answers import BYTES_PER_TOKEN, PIXELS_PER_TOKEN, AnswerBook, Budget, KeptAnswers
 from cosfly.llm.client import ChatClient
-from cosfly.llm.contract import Engine, NoAnswer, Reply, Request, Troubles, started
+from cosfly.llm.contract import Engine, NoAnswer, Reply, Request, started
 from cosfly.llm.student_chat import EncodedImage, encoded_image
 from cosfly.llm.vllm_engine import VllmEngine
 from cosfly.runtime.limits import num_cpus
@@ -159,10 +159,10 @@ def embedded_teacher(cfg: CaptionConfig, seed: int) -> Teacher:
     return RuleTeacher(seed) if cfg.teacher_kind == "rules" else GivenTeacher(cfg, seed)
 
 
-def make_engine(cfg: CaptionConfig, troubles: Troubles | None = None) -> Engine:
-    """Return the engine that the settings name. troubles: Records the failed tries of a server."""
+def make_engine(cfg: CaptionConfig) -> Engine:
+    """Return the engine that the settings name."""
     if cfg.teacher_kind == "endpoint":
-        return ChatClient(cfg.teacher, cfg.endpoint, troubles)
+        return ChatClient(cfg.teacher, cfg.endpoint)
     folder = Path(cfg.teacher.removeprefix("vllm:"))
     return VllmEngine(folder, cfg.vllm, cfg.endpoint, num_images=cfg.num_images, settings="caption")
 
@@ -174,13 +174,12 @@ async def open_teacher(
     seed: int,
     budget: Budget,
     retried: frozenset[str] = frozenset(),
-    troubles: Troubles | None = None,
 ) -> AsyncIterator[Teacher]:
     """Connect to the teacher that the settings name."""
     if cfg.teacher_kind in EMBEDDED:
         yield embedded_teacher(cfg, seed)
         return
-    engine = make_engine(cfg, troubles)
+    engine = make_engine(cfg)
     async with started(engine):
         threads = ThreadPoolExecutor(min(ENCODING_THREADS, num_cpus()), "encode")
         try:

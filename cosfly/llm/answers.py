@@ -13,7 +13,7 @@ import logging
 import re
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Self
@@ -73,11 +73,6 @@ def answer_key(model: str, request: Request) -> str:
     return sha256_bytes(dump_json(parts).encode())
 
 
-def read_answers(journal: Journal) -> Iterator[Answer]:
-    """Yield the answers of a journal; raises InputError for an unusable line."""
-    return journal.read_as(Answer.model_validate)
-
-
 class AnswerBook:
     """The journals of one folder, a context manager. All methods run on one event loop."""
 
@@ -86,7 +81,7 @@ class AnswerBook:
         self.folder = folder
         self.totals: Counter[str] = Counter()  # answers, prompt_tokens, completion_tokens of all runs into this folder
         for path in sorted(folder.glob("*.jsonl")):
-            for answer in read_answers(Journal(path)):
+            for answer in Journal(path).read_as(Answer.model_validate):
                 self._count(answer)
         self._tracks: dict[str, tuple[Journal, dict[str, Answer]]] = {}  # a track's journal, and its answers by key
         self._disk = ThreadPoolExecutor(1, "journal")
@@ -106,7 +101,8 @@ class AnswerBook:
             with journal:  # closed again, so that many tracks in progress take no more files than one
                 journal.append(answer.model_dump(mode="json"))
 
-        await asyncio.get_running_loop().run_in_executor(self._disk, append)
+        # Shielded: an answer is written though its window is cancelled.
+        await asyncio.shield(asyncio.get_running_loop().run_in_executor(self._disk, append))
 
     def forget(self, track: str) -> None:
         """Remove a finished track from memory; its journal stays on the disk."""
@@ -117,7 +113,7 @@ class AnswerBook:
             is_plain = _PLAIN_NAME.fullmatch(track) is not None and len(track.encode()) <= MOST_NAME_BYTES
             name = track if is_plain else f"flight-{sha256_bytes(track.encode())}"
             journal = Journal(self.folder / f"{name}.jsonl")
-            self._tracks[track] = journal, {answer.key: answer for answer in read_answers(journal)}
+            self._tracks[track] = journal, {answer.key: answer for answer in journal.read_as(Answer.model_validate)}
             if journal.num_damaged:
                 log.warning("%s: %d damaged lines are skipped", journal.path, journal.num_damaged)
         return self._tracks[track]

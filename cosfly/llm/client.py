@@ -23,7 +23,7 @@ import httpx
 from pydantic import Field
 
 from cosfly.llm import protocol
-from cosfly.llm.contract import NoAnswer, Reply, Request, Troubles
+from cosfly.llm.contract import NoAnswer, Reply, Request
 from cosfly.llm.protocol import BadReply, Response
 from cosfly.llm.refusals import KEY_VARIABLE, MEANINGS, Kind, Refusal
 from cosfly.runtime.config import Config, MayDiffer
@@ -32,6 +32,7 @@ from cosfly.runtime.model_json import CONTEXT_FULL
 
 log = logging.getLogger(__name__)
 
+SECONDS_BETWEEN_WARNINGS = 10.0
 TOTAL_TIMEOUT_S = 900.0  # limit of one answer with all its tries
 BUSY_STATUS = frozenset({429, 503, 529})
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # the pause after a failed try doubles in this range, with jitter
@@ -129,17 +130,12 @@ class ConcurrencyLimit:
             self._held_until_s = max(self._held_until_s, now_s + retry_after_s)
 
 
-def _num_characters(content: str | list[dict]) -> int:
-    """Return the length of the text of a message."""
-    return len(content) if isinstance(content, str) else sum(len(part.get("text", "")) for part in content)
-
-
 class ChatClient:
     """The engine `endpoint`: sends requests to one server, with retries and a limit on concurrency."""
 
     kind: Literal["endpoint"] = "endpoint"
 
-    def __init__(self, url: str, cfg: EndpointConfig, troubles: Troubles | None = None) -> None:
+    def __init__(self, url: str, cfg: EndpointConfig) -> None:
         """Raise TeacherError if the URL is invalid or contains a secret, or the key or the proxy cannot be used."""
         try:
             protocol.check_url(url)
@@ -148,7 +144,7 @@ class ChatClient:
         self.url = self.where = protocol.base_url(url)
         self.cfg = cfg
         self.model = ""
-        self.troubles = troubles or Troubles()
+        self.num_failed, self._warned_s = 0, -math.inf  # failed tries, and when one was last reported
         self.concurrency = ConcurrencyLimit(cfg.concurrency)
         self.context: int | None = None  # most tokens of prompt and answer together, if the server reports it
         self.left_out: dict[Kind, Refusal] = {}  # what requests are sent without, and the refusals that say why
@@ -182,9 +178,7 @@ class ChatClient:
                 async with self.concurrency.slot():
                     sent_s = time.monotonic()
                     deadline_s = min(deadline_s, sent_s + TOTAL_TIMEOUT_S)
-                    reply = await self._try(request, sent_s)
-                self.troubles.answered()
-                return reply
+                    return await self._try(request, sent_s)
             except NoAnswer as error:
                 if error.is_final:
                     raise
@@ -194,10 +188,7 @@ class ChatClient:
                 num_tries, longest_s = num_tries + 1, min(LONGEST_PAUSE_S, 2.0 * longest_s)
             is_last = num_tries >= self.cfg.max_tries
             is_late = time.monotonic() + pause_s >= deadline_s
-            if self.troubles.failed(failure.detail):
-                action = "giving up" if is_last or is_late else "trying again"
-                count = self.troubles.num
-                log.warning("%s: %s; %s, failed attempts so far: %d", self.where, failure.detail, action, count)
+            self._warn(failure.detail, "giving up" if is_last or is_late else "trying again")
             if is_last:
                 raise failure
             if is_late:
@@ -245,7 +236,7 @@ class ChatClient:
             body = protocol.request_body(self.model, request, with_schema=with_schema, with_system=with_system)
             response = await self._exchange("chat/completions", body)
             try:
-                return self._read(response, "json_schema" if with_schema else "plain")
+                return protocol.read_completion(response, "json_schema" if with_schema else "plain")
             except BadReply as error:
                 raise BadReply(self._clean(str(error))) from None
             except Refusal as refusal:
@@ -263,6 +254,13 @@ class ChatClient:
         if topic not in self._told:
             self._told.add(topic)
             log.log(level, "%s: %s", self.where, message)
+
+    def _warn(self, detail: str, action: str) -> None:
+        """Write a line about a failed try to the log, unless the last one is younger than SECONDS_BETWEEN_WARNINGS."""
+        self.num_failed += 1
+        if time.monotonic() - self._warned_s >= SECONDS_BETWEEN_WARNINGS:
+            self._warned_s = time.monotonic()
+            log.warning("%s: %s; %s, failed attempts so far: %d", self.where, detail, action, self.num_failed)
 
     def _refused(self, refusal: Refusal, sent_s: float) -> NoAnswer | TeacherError:
         """Return the error of a refused request: NoAnswer for this try or this request, TeacherError for all."""
@@ -301,7 +299,10 @@ class ChatClient:
         """Warn once if prompts of different lengths all count the same tokens: the server cuts them."""
         if reply.usage is None:
             return
-        num_characters = sum(_num_characters(message["content"]) for message in request.messages)
+        num_characters = 0
+        for content in (message["content"] for message in request.messages):
+            texts = [content] if isinstance(content, str) else [part.get("text", "") for part in content]
+            num_characters += sum(map(len, texts))
         seen = self._prompts.setdefault(len(request.digests), deque(maxlen=NUM_EQUAL_PROMPTS))
         seen.append((reply.usage.prompt_tokens, num_characters))
         tokens, lengths = {counted for counted, _ in seen}, [length for _, length in seen]
@@ -324,38 +325,22 @@ class ChatClient:
             refusal.message = self._clean(refusal.message)
             if response.status == 200 or not refusal.is_loading or time.monotonic() > deadline_s:
                 break
-            if self.troubles.failed(str(refusal)):
-                log.warning("%s: %s; waiting for the server", self.where, str(refusal))
+            self._warn(str(refusal), "waiting for the server")
             await asyncio.sleep(LOADING_PAUSE_S)
         if response.status in (401, 403):
             raise self._refused(refusal, 0.0)
-        entries = None if response.is_cut else protocol.read_models(response)
-        names = [entry["id"] for entry in entries or ()]
-        if wanted in names or (wanted is None and len(names) == 1):
-            self.model = wanted or names[0]
-            length = (entries or [])[names.index(self.model)].get("max_model_len")
-            self.context = length if type(length) is int else None
-        elif entries is None and wanted:
-            self.model = wanted  # some hosts list no models; the first request shows whether it exists
-        elif entries is None:
+        models = protocol.read_models(response)
+        if models is None and not wanted:
             what = "the server does not return a list of models, so it may not be an OpenAI-compatible endpoint"
             raise self._error(what, got=str(refusal), fix="correct the URL, or pass --model")
-        elif not names:
+        if models == {}:
             raise self._error("the endpoint lists no model with a usable name", fix="pass --model")
-        else:
+        if models is not None and wanted not in models and (wanted or len(models) > 1):
             what = "the endpoint does not have this model" if wanted else "the endpoint has several models"
-            got = wanted or f"{len(names)} models"
-            raise self._error(what, got=got, expected=f"one of {', '.join(names[:8])}", fix="pass --model")
-
-    # --- responses ---
-
-    def _read(self, response: Response, structured: str) -> Reply:
-        """Return the reply in a response; raises Refusal or BadReply."""
-        if response.status != 200:
-            raise protocol.read_refusal(response)
-        if response.is_cut:
-            raise BadReply(f"the response is longer than {MOST_REPLY_MB:g} MB")
-        return protocol.read_completion(response, structured)
+            got, names = wanted or f"{len(models)} models", ", ".join(list(models)[:8])
+            raise self._error(what, got=got, expected=f"one of {names}", fix="pass --model")
+        self.model = wanted or next(iter(models or ()))  # of a host without a list, the first request shows it
+        self.context = (models or {}).get(self.model)
 
     def _error(self, what: str, **parts: Any) -> TeacherError:
         return TeacherError(what, where=self.where, **parts)

@@ -9,7 +9,6 @@ import asyncio
 import os
 import signal
 import threading
-import time
 from collections.abc import AsyncIterator, Coroutine
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -74,38 +73,6 @@ class NoAnswer(Exception):
 
     def __str__(self) -> str:
         return f"{self.cause}: {self.detail}"
-
-
-SECONDS_BETWEEN_WARNINGS = 10.0
-
-
-class Troubles:
-    """Failed tries, for the progress display. last: The last error; None after an answer."""
-
-    def __init__(self) -> None:
-        self.num = 0
-        self.last: str | None = None
-        self._answered_s = time.monotonic()
-        self._warned_s = float("-inf")
-
-    def answered(self) -> None:
-        """Record an answer."""
-        self.last = None
-        self._answered_s = time.monotonic()
-
-    def failed(self, detail: str) -> bool:
-        """Record a failed try; return whether it is time for a line in the log."""
-        self.num += 1
-        self.last = detail
-        is_time = time.monotonic() - self._warned_s >= SECONDS_BETWEEN_WARNINGS
-        if is_time:
-            self._warned_s = time.monotonic()
-        return is_time
-
-    @property
-    def silent_s(self) -> float:
-        """Seconds since the last answer."""
-        return time.monotonic() - self._answered_s
 
 
 class Engine(Protocol):

@@ -196,8 +196,12 @@ def read_completion(response: Response, structured: str) -> Reply:
     """Return the reply in a response; structured: As in `Reply`.
 
     Raises:
-        BadReply: A type or a size is wrong. Refusal: Some servers send one with status 200.
+        BadReply: A type or a size is wrong. Refusal: The server refuses the request; some do with status 200.
     """
+    if response.status != 200:
+        raise read_refusal(response)
+    if response.is_cut:
+        raise BadReply(f"the response is longer than {len(response.body) / 1e6:g} MB")
     value, wait_s = _object(response), response.retry_after_s
     if value is None:
         raise BadReply("the response is not JSON")
@@ -246,9 +250,12 @@ def _usage(value: Any) -> Usage | None:
     return Usage.model_validate(counts) if is_plausible and counts["prompt_tokens"] else None
 
 
-def read_models(response: Response) -> list[dict[str, Any]] | None:
-    """Return the entries of a list of models, each with a usable `id`; None if the response has no list."""
-    entries = (_object(response) or {}).get("data") if response.status == 200 else None
+def read_models(response: Response) -> dict[str, int | None] | None:
+    """Return the models that a server lists, with the length of their context if it is given; None without a list."""
+    value = _object(response) if response.status == 200 and not response.is_cut else None
+    entries = (value or {}).get("data")
     if not isinstance(entries, list):
         return None
-    return [entry for entry in entries if isinstance(entry, dict) and _name(entry.get("id"))]
+    named = [entry for entry in entries if isinstance(entry, dict) and _name(entry.get("id"))]
+    lengths = {entry["id"]: entry.get("max_model_len") for entry in named}
+    return {name: length if type(length) is int else None for name, length in lengths.items()}

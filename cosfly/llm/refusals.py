@@ -37,13 +37,11 @@ def _meanings() -> dict[Kind, Meaning]:
 
 
 MEANINGS = _meanings()
-STATUSES = {  # meaning of a status if no pattern matches the text
-    **dict.fromkeys((401, 403), Meaning("the server refuses the API key", f"set {KEY_VARIABLE} to a valid key", True)),
-    404: Meaning(
-        "the server does not have this model, or the URL is not a chat endpoint", "correct the URL or --model", True
-    ),
-    **dict.fromkeys((*range(300, 400), 405), Meaning("the URL is not a chat endpoint", "correct the URL", True)),
-}
+ADDRESS = Meaning(
+    "the server does not have this model, or the URL is not a chat endpoint", "correct the URL or --model", True
+)
+# The meaning of a status if no pattern matches the text.
+STATUSES = dict.fromkeys((401, 403), MEANINGS["account"]) | dict.fromkeys((*range(300, 400), 404, 405), ADDRESS)
 # Statuses of a server that is busy or away (above 511: Cloudflare's, 424: TGI's of a failed generation); only an empty
 # account takes precedence.
 AWAY = frozenset({408, 409, 424, 425, 429, 502, 503, 504, *range(520, 531)})
