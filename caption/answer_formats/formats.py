@@ -250,7 +250,7 @@ class AnswerFormat:
 
 
 def _read_prose(written: Coc, facts: Facts) -> Draft:
-    return Draft(written, tuple([text for _, text in sentences_of(written)]))
+    return Draft(written, tuple(sentences_of(written)))
 
 
 def _read_prose_mirror(written: Coc, english: Draft, facts: Facts, is_translated: bool) -> Draft | Refused:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -81,9 +81,6 @@ _LEFT_OUT = re.compile(r"\.{3,}|…+|⋯+|。{3,}|·{3,}")
 _SLOT = re.compile(r"\{[^{}]*\}")
 _HAN = re.compile(r"[\u4e00-\u9fff]+")
 _LATIN = re.compile(r"[A-Za-z]{2,}")
-# Chinese with numbers, punctuation, slots and single letters: one scan recognizes most texts.
-_ZH = r"[\u4e00-\u9fff\d\s，。、；：（）！？%/.,;:()-]*+"
-_PLAIN_ZH = re.compile(_ZH + r"(?:(?:\{[^{}]*\}|[A-Za-z](?![A-Za-z{]))" + _ZH + ")*+")
 _OTHER_LETTER = re.compile(r"[^\W\d_a-zA-Z\u00c0-\u024f\u4e00-\u9fff]")
 
 
@@ -150,7 +147,7 @@ def is_in_script(text: str, language: Language) -> bool:
 
     Each letter of another script counts against the language. Slot names are ignored.
     """
-    if text.isascii() if language == "en" else _PLAIN_ZH.fullmatch(text):
+    if language == "en" and text.isascii():
         return True
     text = _SLOT.sub("", text)
     num_han = sum(map(len, _HAN.findall(text)))
@@ -171,11 +168,10 @@ _MARKS = ".。！？!?\n"
 END = re.compile(rf"[{_MARKS}](?:(?<=[。！？!?])[。！？!?]*|(?<=\n)|{_POINT})\s*")
 
 
-def sentences_of(coc: Coc) -> Iterator[tuple[str, str]]:
-    """Yield (name, text) of each sentence of both texts of an answer, in order: C1, C2, ..., R1, R2, ..."""
-    for letter, text in (("C", coc.critical_components), ("R", coc.reasoning_trace)):
-        for number, part in enumerate(cut_sentences(text), 1):
-            yield f"{letter}{number}", part.strip()
+def sentences_of(coc: Coc) -> list[str]:
+    """Return the sentences of both texts of an answer, in order."""
+    texts = (coc.critical_components, coc.reasoning_trace)
+    return [sentence.strip() for text in texts for sentence in cut_sentences(text)]
 
 
 @lru_cache(maxsize=256)  # an English text is cut again for the comparison with its mirrored text

@@ -15,6 +15,7 @@ import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Self
 from weakref import WeakValueDictionary
@@ -218,11 +219,8 @@ class Budget:
             name, used = "max_cost", f"{self.spent:.4f} of {cfg.max_cost:g} is spent"
         else:
             return None
-        problem, fix = (
-            f"the next request may exceed the limit: {used}",
-            "raise the limit and run the same command again",
-        )
-        return BudgetSpent(problem, where=f"budget.{name}", fix=fix)
+        what, fix = f"the next request may exceed the limit: {used}", "raise it and run the same command again"
+        return BudgetSpent(what, where=f"budget.{name}", fix=fix)
 
     def note(self, usage: Usage | None, where: str, num_pictures: int = 0) -> None:
         """Record the size of an answered request; raises TeacherError if a limit is set and no usage is reported."""
@@ -237,29 +235,20 @@ class Budget:
             )
 
 
+@dataclass
 class KeptAnswers:
-    """An engine with a journal and a budget: recorded answers are reused, new ones are recorded."""
+    """An engine with a journal and a budget: recorded answers are reused, new ones are recorded.
 
-    def __init__(
-        self,
-        engine: Engine,
-        book: AnswerBook | None,
-        budget: Budget | None = None,
-        retried: frozenset[str] = frozenset(),
-    ) -> None:
-        """
-        Args:
-            book: None records nothing. budget: None sets no limit.
-            retried: Ids of the samples that are asked again where a recorded answer had filled the context or declined.
+    book: None records nothing. budget: None sets no limit. retried: Ids of the samples that are asked again where a
+    recorded answer had filled the context or declined. listener: Called with each sample id, request and reply.
+    """
 
-        `listener` is called with each sample id, request and reply.
-        """
-        self.engine = engine
-        self.book = book
-        self.budget = budget
-        self.retried = retried
-        self.listener: Callable[[str, Request, Reply], None] = lambda sample_id, request, reply: None
-        self._asking: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()  # by key, held during a request
+    engine: Engine
+    book: AnswerBook | None
+    budget: Budget | None = None
+    retried: frozenset[str] = frozenset()
+    listener: Callable[[str, Request, Reply], None] = lambda sample_id, request, reply: None
+    _asking: WeakValueDictionary[str, asyncio.Lock] = field(default_factory=WeakValueDictionary)  # by key
 
     async def ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:
         """Return the recorded answer, or ask the engine; NoAnswer fails this request, TeacherError all requests."""

@@ -20,7 +20,6 @@ from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import FileFormat, read_model, write_model
 from cosfly.viz.frame_views import View, encode_picture, frame_label
 
-IMAGE_ENCODING: Literal["png"] = "png"
 JPEG_QUALITY = 90
 IMAGE_PART: dict[str, Any] = {"type": "image"}  # a picture in the input of a chat template
 MAX_ANSWER_TOKENS = 512  # 1.5 times the longest answer in training
@@ -80,7 +79,7 @@ def limited_picture(rgb: np.ndarray, max_pixels: int) -> np.ndarray:
 
 def picture_to_send(rgb: np.ndarray, max_pixels: int) -> EncodedImage:
     """Encode a picture, (h, w, 3) uint8 RGB, without loss, scaled down to `max_pixels`; 0 disables scaling."""
-    return encoded_image(limited_picture(rgb, max_pixels), IMAGE_ENCODING)
+    return encoded_image(limited_picture(rgb, max_pixels), "png")
 
 
 def encoded_image(rgb: np.ndarray, encoding: Literal["jpeg", "png"] = "jpeg") -> EncodedImage:
