@@ -63,8 +63,8 @@ class Refusal(Exception):
     """A request that a server refused.
 
     message: the server's text, short, in one line, without the key. wait_s: how long the server asks to wait, if it
-    does. code: the cause, as tallies count it. may_pass: whether the same request may be
-    answered later, because the server is busy, away or broken.
+    does. code: the cause, as tallies count it. may_pass: whether the same request may be answered later, because the
+    server is busy, away or broken.
     """
 
     status: int
