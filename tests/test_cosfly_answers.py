@@ -16,8 +16,7 @@ from tables import each
 from cosfly.formats.captions import TOKENS, Coc, read_captions, write_captions
 from cosfly.llm.answer_text import answer_schema, normalize_action, parse_answer
 from cosfly.llm.contract import Reply
-from cosfly.llm.protocol import BadReply, Response, error_words, read_body, read_completion, read_models
-from cosfly.llm.refusals import Refusal
+from cosfly.llm.protocol import BadReply, Refusal, Response, error_words, read_body, read_completion, read_models
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.model_json import find_object
 

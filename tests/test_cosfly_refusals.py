@@ -4,7 +4,7 @@ import itertools
 import json
 from pathlib import Path
 
-from cosfly.llm.refusals import MEANINGS, MOST_CHARACTERS, Refusal, kind_of
+from cosfly.llm.protocol import MEANINGS, MOST_CHARACTERS, Refusal, kind_of
 
 ROWS = Path(__file__).with_name("refusals.tsv").read_text(encoding="utf-8").splitlines()
 REFUSALS = [row.replace("\\n", "\n").split("\t") for row in ROWS if not row.startswith("#")]

@@ -23,8 +23,7 @@ from caption.teachers.prompts import MAX_RETURNED_CHARACTERS, Correction, make_q
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.client import LEFT_OUT, ChatClient
 from cosfly.llm.contract import Reply, run_until_interrupted
-from cosfly.llm.protocol import BadReply
-from cosfly.llm.refusals import MEANINGS, Refusal
+from cosfly.llm.protocol import MEANINGS, BadReply, Refusal
 from cosfly.llm.student_chat import EncodedImage, encoded_image
 from cosfly.runtime.console import Advance, progress_bar
 from cosfly.runtime.errors import TeacherError

@@ -24,8 +24,7 @@ from pydantic import Field
 
 from cosfly.llm import protocol
 from cosfly.llm.contract import NoAnswer, Reply, Request
-from cosfly.llm.protocol import BadReply, Response
-from cosfly.llm.refusals import KEY_VARIABLE, MEANINGS, Kind, Refusal
+from cosfly.llm.protocol import KEY_VARIABLE, MEANINGS, BadReply, Kind, Refusal, Response
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import TeacherError
 from cosfly.runtime.model_json import CONTEXT_FULL

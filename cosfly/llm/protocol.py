@@ -1,4 +1,9 @@
-"""The chat-completions protocol: checks addresses, writes request bodies and reads responses."""
+"""The chat-completions protocol: checks addresses, writes request bodies, reads responses and the causes of refusals.
+
+Servers share no status codes: what one reports as 400 another reports as 422 or 500. So causes are recognized by the
+text of the server, by one table for all servers, `refusals.yaml`. The patterns match the texts of vLLM, SGLang,
+llama.cpp, TGI, LM Studio, LiteLLM, OpenAI and similar hosts; tests/refusals.tsv lists them.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +11,25 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import httpx
 from pydantic_core import to_json
 
 from cosfly.formats.captions import Usage
 from cosfly.llm.contract import MOST_TOKENS, Reply, Request
-from cosfly.llm.refusals import KEY_VARIABLE, Refusal, kind_of
+from cosfly.runtime.config import read_yaml
 from cosfly.runtime.escaping import without_keys
 from cosfly.runtime.model_json import DECLINED
 
+Kind = Literal[
+    "account", "too_long", "num_images", "no_vision", "no_system", "schema", "parameter", "content", "unknown"
+]
+
+KEY_VARIABLE = "COSFLY_API_KEY"
+MOST_CHARACTERS = 4000  # of a text that are searched: some servers echo the request
+NEVER = "$^"  # a pattern that matches nothing
 THOUGHT_FIELDS = ("reasoning_content", "reasoning", "thinking", "reasoning_details")  # of a message
 MESSAGE_FIELDS = ("message", "msg", "detail")  # of an error
 EVENT_STARTS = (b"data:", b"event:", b"id:", b"retry:", b":")  # of a stream of server-sent events
@@ -50,14 +63,11 @@ def check_url(url: str) -> None:
         raise ValueError(f"{problem}{got}")
 
 
-COMPLETIONS = "/chat/completions"
-
-
 def base_url(url: str) -> str:
     """Return the API root of a URL: of host or host/v1, host/v1; a full chat-completions address is used as given."""
     root = url.rstrip("/")
-    if root.endswith(COMPLETIONS):
-        return root.removesuffix(COMPLETIONS)
+    if root.endswith("/chat/completions"):
+        return root.removesuffix("/chat/completions")
     return root if re.search(r"/v\d+(beta)?(/openai)?$", root) else f"{root}/v1"
 
 
@@ -83,6 +93,79 @@ def without_system(messages: list[dict]) -> list[dict]:
     if isinstance(content, str):
         return [question | {"content": f"{system['content']}\n\n{content}"}, *others]
     return [question | {"content": [{"type": "text", "text": system["content"]}, *content]}, *others]
+
+
+# --- refusals --------------------------------------------------------------------------------------------------------
+
+
+class Meaning(NamedTuple):
+    """A cause of refusals, matched by a pattern. what, fix: of the error. ends_run: all requests are refused."""
+
+    what: str
+    fix: str
+    ends_run: bool
+    pattern: str = NEVER
+
+
+MEANINGS: dict[Kind, Meaning] = {
+    kind: Meaning(cause["what"], cause["fix"], cause["ends_run"], "|".join(cause["patterns"]) or NEVER)
+    for kind, cause in read_yaml(Path(__file__).with_name("refusals.yaml")).items()
+}
+ADDRESS = Meaning(
+    "the server does not have this model, or the URL is not a chat endpoint", "correct the URL or --model", True
+)
+# The meaning of a status if no pattern matches the text.
+STATUSES = dict.fromkeys((401, 403), MEANINGS["account"]) | dict.fromkeys((*range(300, 400), 404, 405), ADDRESS)
+# Statuses of a server that is busy or away (above 511: Cloudflare's, 424: TGI's of a failed generation); only an empty
+# account takes precedence.
+AWAY = frozenset({408, 409, 424, 425, 429, 502, 503, 504, *range(520, 531)})
+
+
+def kind_of(status: int, text: str) -> Kind:
+    """Return the cause of a refusal with this body; `unknown` if no pattern matches."""
+    start = text[:MOST_CHARACTERS]
+    flags = re.IGNORECASE | re.DOTALL
+    matching = (kind for kind, meaning in MEANINGS.items() if re.search(meaning.pattern, start, flags))
+    kind: Kind = "account" if status == 402 else next(matching, "unknown")
+    # In the text of a failed server these words are not about a window or a schema.
+    is_other = status >= 500 and kind in ("content", "schema")
+    return "unknown" if is_other or (status in AWAY and kind != "account") else kind
+
+
+@dataclass(eq=False)
+class Refusal(Exception):
+    """A request that a server refused.
+
+    message: the server's text, short, in one line, without the key. wait_s: how long the server asks to wait, if it
+    does. code: the cause, as tallies count it. may_pass: whether the same request may be answered later, because the
+    server is busy, away or broken.
+    """
+
+    status: int
+    kind: Kind
+    message: str
+    wait_s: float | None = None
+
+    @property
+    def code(self) -> str:
+        return f"refused_{self.status if self.kind == 'unknown' else self.kind}"
+
+    def __str__(self) -> str:
+        return f"HTTP {self.status} {self.message}".rstrip()
+
+    @property
+    def meaning(self) -> Meaning:
+        by_text = MEANINGS[self.kind]
+        return by_text if by_text.ends_run or self.kind == "content" else STATUSES.get(self.status, by_text)
+
+    @property
+    def is_loading(self) -> bool:
+        """Whether the server is loading its model."""
+        return self.status in AWAY and re.search(r"\bloading\b", self.message, re.IGNORECASE) is not None
+
+    @property
+    def may_pass(self) -> bool:
+        return self.kind == "unknown" and (self.status in AWAY or self.status >= 500)
 
 
 # --- responses --------------------------------------------------------------------------------------------------------
