@@ -114,6 +114,12 @@ def test_an_answer_in_parts_is_read_and_a_null_field_is_left_out():
     assert {finding.state for finding in findings.values()} == {"ok"}
 
 
+def test_a_schema_that_is_switched_off_is_not_sent():
+    findings = examine(patient(refuses_schema=True), endpoint={"json_schema": False})
+    assert {finding.state for finding in findings.values()} == {"ok"}
+    assert "switched off" in findings["JSON schema"].detail
+
+
 @each(("defect", "name", "state", "words"), DEFECTS, ids=lambda value: str(value))
 def test_a_defect_is_found(defect, name, state, words):
     findings = examine(patient(**defect), defect.get("context", CONTEXT))

@@ -141,8 +141,11 @@ class _Examination:
         return True
 
     async def _try_schema(self) -> None:
-        reply = await self._ask([_user("Hello! How are you today?")], 256, ODD_SCHEMA)
         plain = "so answers are parsed from plain text"
+        if not self.cfg.endpoint.json_schema:
+            self._add("JSON schema", "ok", f"switched off (endpoint.json_schema=false), {plain}")
+            return
+        reply = await self._ask([_user("Hello! How are you today?")], 256, ODD_SCHEMA)
         if refusal := self.client.left_out.get("schema"):
             self._add("JSON schema", "warning", f"refused, {plain}: {refusal}; {refusal.meaning.fix}")
             return
