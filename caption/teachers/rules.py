@@ -125,6 +125,11 @@ def is_close(f: Facts) -> bool:
     return _or_far(f.distance_m[-1]) <= CLOSE_M
 
 
+def is_slower(f: Facts) -> bool:
+    """Return whether the drone is slower than the target."""
+    return (f.speed_mps[-1] or 0.0) < (f.target_speeds_mps[-1] or 0.0)
+
+
 def sets_off(f: Facts, side: int) -> bool:
     return hurries(f, side) and (f.target_speeds_mps[0] or 0.0) < DRIFTING_MPS
 
@@ -203,9 +208,9 @@ def is_bearing_steady(f: Facts) -> bool:
 
 
 def strafes_on(f: Facts, side: int) -> bool:
-    """Return whether a strafe goes on, and the target does not drift out of the picture on the other side."""
+    """Return whether a strafe goes on, and the target neither leaves nor drifts out of the picture on the other side."""
     first_deg, last_deg = f.bearing_deg[0], f.bearing_deg[-1]
-    if first_deg is None or last_deg is None or not expects(FAMILIES["strafe"])(f, side):
+    if first_deg is None or last_deg is None or gap_opens(f, side) or not expects(FAMILIES["strafe"])(f, side):
         return False
     return side * last_deg >= -LITTLE_DEG and (is_shaken(f) or side * (last_deg - first_deg) >= -2 * DRIFT_DEG)
 
@@ -352,7 +357,8 @@ CONDITIONS: dict[str, Condition] = {
     "similar_near": lambda f, side: f.is_visible_now and f.alike_differences[-1] in range(MOST_DIFFERENCES + 1)
     and _or_far(f.other_distance_m[-1]) <= COMING_M,
     **{f"expects_{name}": expects(family) for name, family in FAMILIES.items()},
-    "expects_slow_down": lambda f, side: not gap_opens(f, side) and expects(FAMILIES["slow_down"])(f, side),
+    "expects_slow_down": lambda f, side: not gap_opens(f, side) and not is_slower(f)
+    and expects(FAMILIES["slow_down"])(f, side),
     **{kind: is_ordered(kind) for kind in MISSION_KINDS},
 }  # fmt: skip
 
