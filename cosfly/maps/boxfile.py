@@ -29,7 +29,7 @@ from shapely.geometry import LineString, Point, Polygon, shape
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource, read_boxes
 from cosfly.formats.columns import LARGEST
 from cosfly.formats.kinds import GROUND_KINDS, KINDS, SURFACE_KINDS
-from cosfly.maps.boxlist import WIDEST_M, BoxList, Dropped, listed, origin_m, required
+from cosfly.maps.boxlist import WIDEST_M, BoxList, SkippedEntries, listed, origin_m, required
 from cosfly.maps.footprints import (
     CUT_SHARES,
     THINNEST_M,
@@ -207,7 +207,7 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
         raise InputError("the file has no boxes", where=path, expected="at least one row or feature with a box")
     boxes = BoxList()
     sources = Counter[str]()
-    dropped = Dropped()
+    dropped = SkippedEntries()
     notes = defaultdict[str, list[str]](list)
     row_of_box: list[int] = []
     metric_rows = _in_metres(rows, units, path, is_table=suffix == ".csv")

@@ -86,7 +86,7 @@ class BoxList:
         return make_box_map(rows[:, :3], rows[:, 3:6], rotations_deg, self.kinds, header=header)
 
 
-class Dropped:
+class SkippedEntries:
     """What a reader does not use of a file: numbers by reason, and the problems of bad entries with their places."""
 
     def __init__(self) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import AliasPath, BaseModel, Field, FiniteFloat
 
 from cosfly.formats.columns import numbers
-from cosfly.maps.boxlist import WIDEST_M, Dropped
+from cosfly.maps.boxlist import WIDEST_M, SkippedEntries
 from cosfly.maps.units import METRES, Units, declared_units, length_m, refused
 from cosfly.runtime.config import read_yaml
 from cosfly.runtime.errors import InputError, counts_text, json_type, shown
@@ -90,7 +90,7 @@ class CityModel(NamedTuple):
     """The objects that a rule covers, and those that are not used."""
 
     objects: list[CityObject]
-    dropped: Dropped
+    dropped: SkippedEntries
     num_objects: int
     version: str
 
@@ -151,7 +151,7 @@ def read_model(path: Path, units: Units, most_skipped: float) -> CityModel:
     objects = dict[str, CityObject]()
     seen_ids = set[str]()
     num_objects = 0
-    dropped = Dropped()
+    dropped = SkippedEntries()
     for where, part in [(str(path), head), *features] if head.objects else features:
         with np.errstate(all="ignore"):  # each ring is checked for finite numbers
             vertices = _vectors(part.vertices, f"{where}: vertices") * head.scale + head.translate
