@@ -8,9 +8,9 @@ README.md                                  for `datasets.load_dataset`
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Self, get_args, get_origin, overload
+from typing import Any, Literal, Self, get_args, get_origin
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -57,7 +57,6 @@ class Sample(SplitMember):
     decision: str  # the answer's flight_decision
     label: str | None  # the decision that the future geometry implies; None: undetermined
     contradicted: tuple[str, ...] | None  # decisions that the future geometry rules out; None: unknown
-    weight: float = 1.0
     past: tuple[float, ...] = ()  # see cosfly/inspection/blind_baseline.py; () if unknown
 
     @property
@@ -128,9 +127,11 @@ def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
     return {tree.run: found[tree.sha256] for tree in trees}
 
 
-def tree_inputs(trees: Mapping[str, Path]) -> dict[str, Path]:
-    """Name playback trees as inputs of a stage: `data`; of several with a number in front."""
-    return {f"{number}.data" if len(trees) > 1 else "data": tree for number, tree in enumerate(trees.values(), 1)}
+def tree_inputs(trees: Collection[Path], captions: Collection[Path] = ()) -> dict[str, Path]:
+    """Name playback trees and their captions as inputs of a stage: `data`, `captions`; of several with a number."""
+    numbers = [f"{number}." for number in range(1, len(trees) + 1)] if len(trees) > 1 else [""]
+    named = {"data": trees, "captions": captions}.items()
+    return {number + name: path for name, paths in named for number, path in zip(numbers, paths, strict=False)}
 
 
 def arrow_type(of: Any) -> pa.DataType:
@@ -164,24 +165,16 @@ class Samples(Sequence[Sample]):
     def __init__(self, dataset: Path, split: Split, *, text_only: bool = False) -> None:
         self.text_only, self.path = text_only, split_path(dataset, split)
         has_file = read_training_set(dataset).samples.get(split)
-        self._rows = TableRows(self.path, columns_of(Sample).names) if has_file else None
+        self._rows: Sequence[dict[str, Any]] = TableRows(self.path, columns_of(Sample).names) if has_file else ()
 
     def __len__(self) -> int:
-        return 0 if self._rows is None else len(self._rows)
+        return len(self._rows)
 
     def __iter__(self) -> Iterator[Sample]:
-        return (self._sample(number, row) for number, row in enumerate(self._rows or ()))
+        return (self._sample(number, row) for number, row in enumerate(self._rows))
 
-    @overload
-    def __getitem__(self, index: int) -> Sample: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[Sample]: ...
-    def __getitem__(self, index: int | slice) -> Sample | list[Sample]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        if self._rows is None or not -len(self) <= index < len(self):
-            raise IndexError(index)
-        return self._sample(index % len(self), self._rows[index % len(self)])
+    def __getitem__(self, number: int) -> Sample:  # type: ignore[override]  # one sample at a time
+        return self._sample(number, self._rows[number])
 
     def _sample(self, number: int, row: dict[str, Any]) -> Sample:
         sample = validated(Sample, row, f"{self.path}: row {number}")
@@ -196,15 +189,19 @@ def open_split(dataset: Path, split: Split, *, text_only: bool = False) -> Sampl
 class SplitWriter:
     """Writes records to one parquet file per split; at most a row group of each split waits in memory.
 
-    paths: files written. counts: records of each split.
+    counts: records of each split.
     """
 
     def __init__(self, out: Path, model: type[SplitMember]) -> None:
         self._out, self._columns, self._stack = out, columns_of(model), contextlib.ExitStack()
-        self.paths: list[Path] = []
         self.counts: dict[Split, int] = dict.fromkeys(SPLITS, 0)
         self._rows: dict[Split, list[dict[str, Any]]] = {split: [] for split in SPLITS}
         self._writers: dict[Split, pq.ParquetWriter] = {}
+
+    @property
+    def paths(self) -> list[Path]:
+        """Files written."""
+        return [split_path(self._out, split) for split, count in self.counts.items() if count]
 
     def add(self, split: Split, record: SplitMember) -> None:
         self.counts[split] += 1
@@ -223,12 +220,10 @@ class SplitWriter:
     def _write(self, split: Split) -> None:
         rows, self._rows[split] = self._rows[split], []
         if rows and split not in self._writers:
-            path = split_path(self._out, split)
             # Statistics of whole prompts would make the footer large.
-            file = self._stack.enter_context(atomic_file(path))
+            file = self._stack.enter_context(atomic_file(split_path(self._out, split)))
             writer = pq.ParquetWriter(file, self._columns, compression="zstd", write_statistics=False)
             self._writers[split] = self._stack.enter_context(writer)
-            self.paths.append(path)
         if rows:
             self._writers[split].write_table(pa.Table.from_pylist(rows, schema=self._columns))
 

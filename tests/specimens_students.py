@@ -2,17 +2,20 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from specimens_distill import make_captions, prepared
 
 from distill.schema import Sample, open_split, resolve_trees
-from distill.student.chat import prompt_batch
+from distill.student.chat import EncodedSample, prompt_batch
 from distill.student.features import PictureReader, Tensors, encode, pictures_of
 from distill.student.model import Student, load_student
 from distill.student.random_student import make_random_student
+from distill.training.loss import answer_loss
 from specimens import make_playback_tree
 
 MAX_PIXELS = 64 * 64
@@ -68,6 +71,21 @@ def features_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Pat
     reader = PictureReader(own, trees, own.dtype, MAX_PIXELS)
     with torch.no_grad():
         return [encode(own, [reader.read(picture)])[0] for sample in samples for picture in pictures_of(sample)]
+
+
+def nats_of(own: Student, rows: Sequence[EncodedSample], features: Sequence[Tensors], chunk: int = 64) -> list[float]:
+    """The loss of each row in a batch: all other rows weigh nothing."""
+    import torch
+
+    found = []
+    for number in range(len(rows)):
+        weighed = [
+            replace(row, weights=np.full(len(row.answer_ids), float(i == number), np.float32))
+            for i, row in enumerate(rows)
+        ]
+        with torch.no_grad():
+            found.append(float(answer_loss(own, weighed, features, chunk)))
+    return found
 
 
 def log_of(out: Path, kind: str = "loss") -> list[dict]:

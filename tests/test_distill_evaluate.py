@@ -19,7 +19,7 @@ from distill.evaluation.bertscore import Scorer
 from distill.evaluation.figures import Answers, coc_of, measure, text_of
 from distill.evaluation.report import REPORT_FORMAT, Evaluation
 from distill.evaluation.stage import asked_samples, floors_of, majority, run
-from distill.inference.outcome import failed_prediction, make_prediction
+from distill.inference.stage import failed_prediction, make_prediction
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split
 

@@ -2,21 +2,24 @@
 
 import importlib.util
 import json
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from later import torch
+from PIL import Image
 from specimens_families import FAMILIES, TEXT_ONLY, WITH_PICTURES, make_family
-from specimens_students import begun, features_of, log_of, losses_of, pixels_of, run, samples_of, trees_of
+from specimens_students import begun, features_of, log_of, losses_of, nats_of, pixels_of, run, samples_of, trees_of
 from tables import each
 
 from cosfly.formats.predictions import read_predictions
+from cosfly.llm.student_chat import limited_picture
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
 from distill.inference import merge
 from distill.inference import stage as infer
-from distill.student.chat import AnswerWeights, padded
+from distill.student.chat import padded
 from distill.student.model import load_student
 from distill.training.loss import answer_loss
 
@@ -41,15 +44,17 @@ def test_the_loss_is_that_of_the_library(place, family):
         assert all("No pictures are given." in s.prompt.user or "未提供图像。" in s.prompt.user for s in samples)
     rows = [own.encode(sample, 64 * 64) for sample in samples]
     own.model.train()
+    features = features_of(own, samples, trees)
     with torch.no_grad():
-        total, nats = answer_loss(own, rows, features_of(own, samples, trees), 16)
+        total = answer_loss(own, rows, features, 16)
+    nats = nats_of(own, rows, features, 16)
     for sample, row, found in zip(samples, rows, nats, strict=True):
         inputs = {name: torch.from_numpy(array) for name, array in padded(own, [row]).items() if name != "weights"}
         inputs["attention_mask"] = torch.ones_like(inputs["input_ids"])
         with torch.no_grad():
             wanted = own.model(**inputs, **pixels_of(own, [sample], trees)).loss
-        assert float(found) / len(row.answer_ids) == pytest.approx(float(wanted), rel=1e-4)
-    assert float(total) == pytest.approx(float(nats.sum()), rel=1e-5)
+        assert found / len(row.answer_ids) == pytest.approx(float(wanted), rel=1e-4)
+    assert float(total) == pytest.approx(sum(nats), rel=1e-5)
 
 
 def test_prompt_answer_and_end_are_what_the_template_writes(place, family):
@@ -63,18 +68,26 @@ def test_prompt_answer_and_end_are_what_the_template_writes(place, family):
 
 
 @each("name", WITH_PICTURES)
-def test_a_picture_takes_the_tokens_that_the_family_s_processor_says(name, built_once):
-    """Training, inference and a server ask the family's processor with the same picture; its features are as many."""
+def test_a_picture_takes_the_tokens_that_the_family_s_processor_says(name, place, built_once):
+    """Training writes the prompt that a server makes of the picture that it is sent; its features are as many."""
     folder = built_once(f"family_{name}", lambda root: make_family(name, root / name)) / name
-    own = load_student(folder, device="cpu")
-    for size_px in SIZES_PX:
+    own, sample = load_student(folder, device="cpu"), samples_of(place)[0]
+    token = getattr(own.core.config, "image_token_id", None) or own.core.config.image_token_index
+    width = own.core.config.get_text_config().hidden_size
+    for size_px, max_pixels, frames in product(SIZES_PX, (0, 40 * 40), (5, 1)):
+        seen = sample.model_copy(update={"picture_px": size_px, "window": sample.window[:frames]})
+        taught = own.encode(seen, max_pixels).prompt_ids
         picture = np.random.default_rng(0).integers(0, 255, (*size_px[::-1], 3), dtype=np.uint8)
-        inputs = {n: torch.from_numpy(a) for n, a in own.picture_inputs(picture, is_alone=True).items()}
+        sent = limited_picture(picture, max_pixels)
+        images = [[Image.fromarray(sent)] * frames]
+        served = own.library(text=[own.prompt_text(seen)], images=images, add_special_tokens=False)["input_ids"][0]
+        assert taught.tolist() == list(served), (size_px, max_pixels, frames)
+        inputs = {n: torch.from_numpy(a) for n, a in own.picture_inputs(sent, is_alone=frames == 1).items()}
         with torch.no_grad():
             pooled = own.core.base_model.get_image_features(**inputs).pooler_output
         parts = pooled if isinstance(pooled, list | tuple) else [pooled]
-        width = own.core.config.get_text_config().hidden_size
-        assert sum(part.numel() for part in parts) // width == own.picture_tokens(size_px), size_px
+        num_features = sum(part.numel() for part in parts) // width
+        assert num_features * frames == list(taught).count(token) > 0, (size_px, max_pixels, frames)
 
 
 @pytest.mark.slow
@@ -100,7 +113,7 @@ def test_a_family_trains_resumes_merges_and_answers(place, family, tmp_path):
 def test_the_decision_can_weigh_more_and_come_first(place, built_once):
     folder = built_once("family_llama", lambda root: make_family("llama", root / "llama")) / "llama"
     own, sample = load_student(folder, device="cpu"), samples_of(place)[0].without_pictures()
-    row = own.encode(sample, weights=AnswerWeights(decision=20.0, reason=0.5))
+    row = own.encode(sample, weights={"flight_decision": 20.0, "reasoning_trace": 0.5})
     for weight, field in ((20.0, "flight_decision"), (0.5, "reasoning_trace")):
         text = own.tokenizer.decode(row.answer_ids[row.weights == weight])
         assert json.loads(sample.answer)[field] in text

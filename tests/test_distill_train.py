@@ -275,9 +275,9 @@ def test_a_loss_that_is_no_number_leaves_the_last_good_checkpoint(place, tmp_pat
     real, calls = fit.answer_loss, []
 
     def broken(*args):
-        total, nats = real(*args)
+        total = real(*args)
         calls.extend([1] * torch.is_grad_enabled())  # of steps, not of validations
-        return (total * float("nan"), nats) if len(calls) > 13 else (total, nats)
+        return total * float("nan") if len(calls) > 13 else total
 
     with monkeypatch.context() as patch:
         patch.setattr(fit, "answer_loss", broken)

@@ -33,9 +33,7 @@ def run(model: Path, adapter: Path, out: Path, *, resume: Resume = "if-same") ->
         fix = "use this folder as the model"
         raise InputError("the folder has a whole model, so there is nothing to merge", where=adapter, fix=fix)
     model = student_path(str(model))
-    check_adapter(adapter, model)
-    files = {f"adapter/{path.name}": path for path in sorted(adapter.iterdir()) if path.is_file()}
-    inputs = {**weight_files(model), **files}
+    inputs = {**weight_files(model), **check_adapter(adapter, model)}
     stage = StageFolder.open(out, STAGE, config=Config(), inputs=inputs, seed=0, resume=resume)
     merged = out / "model"
     if stage.is_complete:

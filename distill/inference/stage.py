@@ -6,17 +6,18 @@ import asyncio
 import contextlib
 import logging
 import time
+from collections import Counter
 from collections.abc import AsyncGenerator, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from pydantic import Field
 
 from cosfly.formats.places import flight_of
-from cosfly.formats.predictions import PREDICTIONS, Split
-from cosfly.llm.answer_text import answer_schema
+from cosfly.formats.predictions import FAILED, PREDICTIONS, Prediction, Split
+from cosfly.llm.answer_text import answer_schema, parse_answer
 from cosfly.llm.answers import Answer, AnswerBook, KeptAnswers, answer_key
 from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import STOP_AFTER_FAILURES, Engine, NoAnswer, Request, started
@@ -33,8 +34,8 @@ from cosfly.runtime.console import Advance, progress_bar
 from cosfly.runtime.errors import ConfigError, InputError, TeacherError
 from cosfly.runtime.io import atomic_file, sha256_bytes
 from cosfly.runtime.json_io import dump_json
-from cosfly.runtime.run_dir import Resume, StageFolder, write_failures
-from distill.inference.outcome import Results, SampleOutcome, failed
+from cosfly.runtime.model_json import CONTEXT_FULL
+from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, read_manifest, read_stage_record, write_failures
 from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
 from distill.student.chat import EncodedSample, load_pictures
 from distill.student.features import FramePicture, PictureReader, Tensors, pictures_of, read_features
@@ -92,6 +93,67 @@ class InferConfig(Config):
     def sampling(self) -> StudentEndpointConfig:
         """How engines are asked."""
         return self.endpoint.model_copy(update={"max_tokens": self.max_new_tokens, "json_schema": self.constrained})
+
+
+# --- outcomes ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SampleOutcome:
+    """A sample with its answer, or with the reason why there is none. is_new: not recorded by an earlier run."""
+
+    sample: Sample
+    found: Answer | Failed
+    is_new: bool = False
+
+    @classmethod
+    def failed(cls, sample: Sample, code: str, error: object) -> Self:
+        """Return the outcome of a sample that got no answer."""
+        return cls(sample, Failed(id=sample.key, code=code, message=str(error)))
+
+
+def make_prediction(sample: Sample, split: Split, text: str, num_tokens: int, is_finished: bool) -> Prediction:
+    """Parse an answer and return its record."""
+    parsed = parse_answer(text, sample.language, finish_reason=None if is_finished else "length")
+    own = sample.model_dump(include={"sample_id", "language", "run", "window_id"})
+    answer = {"raw": text, "num_tokens": num_tokens, "is_finished": is_finished}
+    return Prediction(
+        **own, **answer, split=split, coc=parsed.coc, reason=parsed.reason, recovered=list(parsed.recovered)
+    )
+
+
+def failed_prediction(sample: Sample, split: Split, code: str) -> Prediction:
+    """Return the record of a sample without an answer: empty, with a reason that counts as no wrong answer."""
+    return make_prediction(sample, split, "", 0, False).model_copy(update={"reason": f"{FAILED}{code}"})
+
+
+@dataclass
+class Results:
+    """Counts of the outcomes of a run. new: answers of this run and their tokens."""
+
+    tally: Tally = field(default_factory=Tally)
+    failures: list[Failed] = field(default_factory=list)
+    num_parsed: int = 0
+    new: Counter[str] = field(default_factory=Counter)
+
+    def add(self, outcome: SampleOutcome, split: Split) -> Prediction:
+        """Count an outcome and return its record."""
+        sample, found = outcome.sample, outcome.found
+        self.tally.input += 1
+        if isinstance(found, Failed):
+            self.tally.count(found)
+            self.failures.append(found)
+            return failed_prediction(sample, split, found.code)
+        self.tally.kept += 1
+        if outcome.is_new:
+            self.new.update(found.usage, answers=1)
+        is_finished = found.finish_reason not in ("length", CONTEXT_FULL)
+        prediction = make_prediction(sample, split, found.text, found.usage.get("completion_tokens", 0), is_finished)
+        self.num_parsed += prediction.coc is not None
+        return prediction
+
+
+# --- students in this process, and engines ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -168,9 +230,9 @@ class LocalAnswers:
                 if bad is None:
                     rows.append((self.student.encode(sample, self.max_pixels), sample))
                 else:
-                    found[sample.key] = failed(sample, InputError.code, errors[bad])
+                    found[sample.key] = SampleOutcome.failed(sample, InputError.code, errors[bad])
             except InputError as error:
-                found[sample.key] = failed(sample, error.code, error)
+                found[sample.key] = SampleOutcome.failed(sample, error.code, error)
         start_s = time.monotonic()
         completions = self._decode(rows, features) if rows else []
         latency_s = round(time.monotonic() - start_s, 3)
@@ -234,10 +296,10 @@ class EngineAnswers:
                 request = await asyncio.to_thread(make_request, sample, self.trees, *how)
                 reply = await self._kept.ask(request, flight, sample.sample_id, sample.language)
             except InputError as error:
-                return failed(sample, error.code, error)
+                return SampleOutcome.failed(sample, error.code, error)
             except NoAnswer as error:
                 self._note_failure(error)
-                return failed(sample, error.cause, error)
+                return SampleOutcome.failed(sample, error.cause, error)
             finally:
                 advance(1)
         self._failed_in_row = 0
@@ -255,15 +317,21 @@ class EngineAnswers:
             raise TeacherError(words, where=self.engine.where, got=str(error), fix=fix)
 
 
-def _with_model_name(cfg: InferConfig, url: str) -> InferConfig:
-    """Return the settings with the name of the model that a server serves: a folder has the answers of one student."""
-    client = ChatClient(url, cfg.sampling)
+def _with_model_name(cfg: InferConfig, url: str, out: Path) -> InferConfig:
+    """Return the settings with the name of the model that a server serves: a folder has the answers of one student.
+
+    The server of a complete folder may be gone: its record has the name.
+    """
 
     async def ask() -> str:
+        client = ChatClient(url, cfg.sampling)
         async with started(client):
             return client.model
 
-    return cfg.model_copy(update={"endpoint": cfg.endpoint.model_copy(update={"model": asyncio.run(ask())})})
+    is_complete = (out / "manifest.json").is_file() and not read_manifest(out).counts.failed
+    recorded = read_stage_record(out).config.get("endpoint", {}).get("model") if is_complete else None
+    name = cfg.endpoint.model or recorded if is_complete else asyncio.run(ask())
+    return cfg.model_copy(update={"endpoint": cfg.endpoint.model_copy(update={"model": name})})
 
 
 def run(
@@ -293,7 +361,7 @@ def run(
         TeacherError: the engine does not answer. NothingKept: no sample was answered.
     """
     trees = resolve_trees(dataset, data)
-    files: dict[str, Path] = {"dataset": dataset, **tree_inputs(trees)}
+    files: dict[str, Path] = {"dataset": dataset, **tree_inputs(trees.values())}
     if cfg.engine == "transformers":
         require("torch", "transformers", "peft")
     elif adapter is not None:
@@ -301,13 +369,12 @@ def run(
         words = "only the engine transformers can load an adapter"
         raise ConfigError(words, where=f"{STAGE}.engine", got=cfg.engine, fix=fix)
     if cfg.engine == "endpoint":
-        cfg = _with_model_name(cfg, str(model))
+        cfg = _with_model_name(cfg, str(model), out)
     else:
         model = student_path(str(model), allow_code=cfg.allow_code)
         files |= weight_files(model)
     if adapter is not None:
-        check_adapter(adapter, Path(model))
-        files |= {f"adapter/{path.name}": path for path in sorted(adapter.iterdir()) if path.is_file()}
+        files |= check_adapter(adapter, Path(model))
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=files, seed=0, resume=resume)
     if stage.is_complete:
         return out / PREDICTIONS
@@ -315,8 +382,7 @@ def run(
     if not len(split):
         fix = "pass --set distill.infer.split=val, or prepare more pedestrian trajectories"
         raise InputError("the split is empty", where=dataset, got=cfg.split, fix=fix)
-    samples = split[: cfg.max_samples] if cfg.max_samples else split
-    given = Inputs(samples, trees, model, adapter)
+    given = Inputs([*islice(split, cfg.max_samples)] if cfg.max_samples else split, trees, model, adapter)
     start_s = time.monotonic()
     name = str(cfg.endpoint.model) if cfg.engine == "endpoint" else given.name
     results = asyncio.run(_answer_all(cfg, given, out, name))
@@ -329,7 +395,7 @@ def run(
 
 async def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path, model: str) -> Results:
     """Answer all samples, and write a record of each and the failures."""
-    results = Results(cfg.split, model)
+    results = Results()
     async with contextlib.AsyncExitStack() as stack:
         book = stack.enter_context(AnswerBook(out / ANSWERS))
         advance = stack.enter_context(progress_bar(STAGE, total=len(inputs.samples)))
@@ -348,6 +414,7 @@ async def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path, model: str) -
         outcomes = await stack.enter_async_context(contextlib.aclosing(answering.answers(inputs.samples, advance)))
         with atomic_file(out / PREDICTIONS) as file:
             async for outcome in outcomes:
-                file.write((dump_json(results.add(outcome).model_dump(mode="json")) + "\n").encode())
+                prediction = results.add(outcome, cfg.split).model_copy(update={"model": model})
+                file.write((dump_json(prediction.model_dump(mode="json")) + "\n").encode())
     write_failures(out / "failures.jsonl", results.failures)
     return results

@@ -5,7 +5,6 @@ Needs neither captions nor torch.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -16,9 +15,10 @@ from pydantic import Field
 
 from cosfly.formats.places import Place, flight_ids, place_of, sample_id
 from cosfly.formats.playback import ORIGINAL, Track, read_track
+from cosfly.formats.predictions import Split
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.geometry.axes import step_s
-from cosfly.geometry.splits import Course, walks_of
+from cosfly.geometry.splits import SPLITS, Course, walks_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, fingerprint, write_failures
@@ -70,10 +70,6 @@ class DualTrackConfig(SplitConfig):
         return self.observed + self.predicted
 
 
-def _key(place: Place) -> str:
-    return f"{place.run}/{place.town}/{place.trajectory}"
-
-
 def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
     """Read playback trees; write windows by split into `out`, which is returned.
 
@@ -85,30 +81,33 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
     """
     check_names([run_of(tree) for tree in trees])
     runs = {run_of(tree): tree for tree in trees}
-    stage = StageFolder.open(out, STAGE, config=cfg, inputs=tree_inputs(runs), seed=seed, resume=resume)
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=tree_inputs(runs.values()), seed=seed, resume=resume)
     if stage.is_complete:
         return out
     # Two passes: the splits must be known before the first window is written.
     folders = {place_of(folder, run): folder for run, tree in runs.items() for folder in find_tracks(tree)}
     ids = flight_ids(folders)
-    paired, courses, tally = _survey(stage, cfg, folders)
-    walks = walks_of(courses)
-    split_of = cfg.assigned({_key(place) for place in paired}, walks, seed)
+    courses, tally = _survey(stage, cfg, folders)
+    walks = walks_of(courses.values())
+    split_of = cfg.assigned({course.name for course in courses.values()}, walks, seed)
+    tracks: dict[Split, list[str]] = {split: [] for split in SPLITS}
     num_windows = 0
-    with SplitWriter(out, TrackSample).writing() as writer, progress_bar(f"{STAGE}: writing", len(paired)) as advance:
-        for place in paired:
+    with SplitWriter(out, TrackSample).writing() as writer, progress_bar(f"{STAGE}: writing", len(courses)) as advance:
+        for place, course in courses.items():
             advance(1)
             pair = _read_pair(folders[place], cfg)
             assert isinstance(pair, tuple), "the track was changed while it was read"
+            walk, split = walks[course.name], split_of[course.name]
+            tracks[split].append(walk)
             num_windows += len(windows_of(len(pair[0]), cfg))
-            for sample in samples_of(place, ids[place], *pair, walks[_key(place)], cfg):
-                writer.add(split_of[_key(place)], sample)
+            for sample in samples_of(place, ids[place], *pair, walk, cfg):
+                writer.add(split, sample)
     sources = [SourceTree(run=name, sha256=fingerprint(tree)) for name, tree in runs.items()]
     page = write_page(out, "Windows over two tracks", writer.counts, sources, PAGE_TEXT.format(cfg=cfg))
-    facts = {}
-    for split, count in writer.counts.items():
-        keys = [_key(place) for place in paired if split_of[_key(place)] == split]
-        facts[split] = {"samples": count, "tracks": len(keys), "walks": len({walks[key] for key in keys})}
+    facts = {
+        split: {"samples": writer.counts[split], "tracks": len(found), "walks": len(set(found))}
+        for split, found in tracks.items()
+    }
     num_uneven = num_windows - sum(writer.counts.values())
     stage.finish([*writer.paths, page], tally, splits=facts, windows_left_out={"uneven_steps": num_uneven})
     return out
@@ -116,32 +115,30 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
 
 def _survey(
     stage: StageFolder, cfg: DualTrackConfig, folders: Mapping[Place, Path]
-) -> tuple[list[Place], list[Course], Tally]:
-    """Return the perturbed tracks that give windows, their courses, and the counts of all tracks."""
-    paired: list[Place] = []
-    courses: list[Course] = []
-    dropped: Counter[str] = Counter()
-    failures: list[Failed] = []
+) -> tuple[dict[Place, Course], Tally]:
+    """Return the courses of the perturbed tracks that give windows, and the counts of all tracks."""
+    courses: dict[Place, Course] = {}
+    tally, failures = Tally(), list[Failed]()
     with progress_bar(f"{STAGE}: reading", total=len(folders)) as advance:
         for place, folder in folders.items():
             advance(1)
+            key = f"{place.run}/{place.town}/{place.trajectory}"
             try:
                 pair = None if folder.name == ORIGINAL else _read_pair(folder, cfg)
             except InputError as error:
-                name = f"{_key(place)}/{place.variant}"
-                failures.append(Failed(id=name, code=error.code, message=str(error)))
+                failures.append(Failed(id=f"{key}/{place.variant}", code=error.code, message=str(error)))
+                tally.count(failures[-1])
                 continue
             if isinstance(pair, str):
-                dropped[pair] += 1
+                tally.dropped[pair] += 1
             elif pair is not None:
-                paired.append(place)
-                courses.append(Course(_key(place), place.town, pair[1].time_s, pair[1].walked_m).at_seconds())
+                courses[place] = Course(key, place.town, pair[1].time_s, pair[1].walked_m).at_seconds()
     write_failures(stage.path / "failures.jsonl", failures)
-    failed = Counter(failure.code for failure in failures)
-    tally = Tally(input=len(paired) + dropped.total() + len(failures), kept=len(paired), dropped=dropped, failed=failed)
-    if not paired:
+    tally.kept = len(courses)
+    tally.input = tally.kept + tally.dropped.total() + len(failures)
+    if not courses:
         raise stage.nothing_kept(tally, expected=f"a perturbed track of {cfg.length} frames with its clean track")
-    return paired, courses, tally
+    return courses, tally
 
 
 def _read_pair(folder: Path, cfg: DualTrackConfig) -> tuple[Track, Track] | str | None:

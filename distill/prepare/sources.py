@@ -41,15 +41,6 @@ class RunSource:
         return cls(run_of(data), data, captions)
 
 
-def inputs_of(sources: Sequence[RunSource]) -> dict[str, Path]:
-    """Return the inputs of a stage by name: `data` and `captions`, with a number in front if there are several runs."""
-    inputs: dict[str, Path] = {}
-    for number, source in enumerate(sources, 1):
-        files = {"data": source.data, "captions": source.captions}
-        inputs |= {f"{number}.{name}" if len(sources) > 1 else name: path for name, path in files.items()}
-    return inputs
-
-
 def run_of(tree: Path) -> str:
     """Return the name of the run of a playback tree: that of the folder that contains it."""
     return folder_name(tree.absolute().parent.name)

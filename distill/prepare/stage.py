@@ -10,7 +10,6 @@ import hashlib
 import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ from cosfly.formats.captions import Caption, Language, Place, Verdict, read_capt
 from cosfly.formats.frames import frame_name, frame_path
 from cosfly.formats.places import Place as TrackPlace
 from cosfly.formats.places import flight_ids, sample_id
+from cosfly.formats.places import place_of as track_place
 from cosfly.formats.playback import Track, read_track
 from cosfly.formats.predictions import Split
 from cosfly.formats.tracks import find_tracks
@@ -33,8 +33,8 @@ from cosfly.runtime.io import inside
 from cosfly.runtime.json_io import dump_json, write_model
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally, fingerprint, record_of
 from cosfly.viz.frame_views import DEPTH_RANGE_M, VIEW_FILES, Pictures, View, scaled_size
-from distill.prepare.sources import RunSource, SplitConfig, check_names, inputs_of
-from distill.schema import RECORD, RECORD_FORMAT, Sample, SourceTree, SplitWriter, TrainingSet, write_page
+from distill.prepare.sources import RunSource, SplitConfig, check_names
+from distill.schema import RECORD, RECORD_FORMAT, Sample, SourceTree, SplitWriter, TrainingSet, tree_inputs, write_page
 
 log = logging.getLogger(__name__)
 
@@ -120,25 +120,16 @@ def make_sample(
     )
 
 
-@dataclass(frozen=True)
-class _CaptionedTrack:
-    """What is known of the track of captions. name: unique among all runs. frames: that have all files of the views.
-
-    size_px: (width, height); None if the tree does not have the track. key: `run/town/trajectory`.
-    """
+class _Window(NamedTuple):
+    """The samples of one caption in all languages, and the reasons for missing ones. key: `run/town/trajectory`."""
 
     key: str
-    name: str | None
-    size_px: tuple[int, int] | None
-    frames: frozenset[int]
-
-
-class _Window(NamedTuple):
-    """The samples of one caption in all languages, and the reasons for missing ones."""
-
-    track: _CaptionedTrack
     samples: list[Sample]
     reasons: list[str]
+
+    def rank(self, seed: int) -> int:
+        """Return a random number of a window with samples, which does not depend on the other windows."""
+        return int.from_bytes(hashlib.sha256(f"{seed}/{STAGE}/{self.samples[0].sample_id}".encode()).digest()[:8])
 
 
 class _Windows:
@@ -149,69 +140,57 @@ class _Windows:
 
     def __init__(self, cfg: PrepareConfig, sources: Sequence[RunSource]) -> None:
         self._cfg, self._sources = cfg, sources
-        self._tracks: dict[tuple[str, Path], _CaptionedTrack] = {}
+        self._frames: dict[Path, frozenset[int]] = {}  # of a track: those that have all files of the views
         self.courses: list[Course] = []
-        self._read = lru_cache(maxsize=4)(lambda folder: read_track(folder, strict=False))
-        places = [
-            TrackPlace(source.run, *folder.relative_to(source.data).parts[-3:])
-            for source in (sources if len(sources) > 1 else ())
-            for folder in find_tracks(source.data)
-        ]
-        self._ids = flight_ids(places)
         self.walks: Mapping[str, str] = {}
+        self._read = lru_cache(maxsize=4)(lambda folder: read_track(folder, strict=False))
+        trees = [(source.run, source.data) for source in sources] if len(sources) > 1 else []
+        self._ids = flight_ids([track_place(folder, run) for run, tree in trees for folder in find_tracks(tree)])
 
     def __iter__(self) -> Iterator[_Window]:
         for source in self._sources:
             for caption in read_captions(source.captions):
-                yield self._window(source, caption)
+                place = TrackPlace(source.run, caption.town, caption.trajectory, caption.variant)
+                window = _Window(f"{source.run}/{caption.town}/{caption.trajectory}", [], [])
+                for language in self._cfg.languages:
+                    found = self._sample(source, place, window.key, caption, language)
+                    (window.samples if isinstance(found, Sample) else window.reasons).append(found)  # type: ignore[arg-type]
+                yield window
 
-    def _window(self, source: RunSource, caption: Caption) -> _Window:
-        names = (caption.town, caption.trajectory, caption.variant)
-        folder = inside(source.data, "/".join(names), in_parent=True)
-        if (source.run, folder) not in self._tracks:
-            self._tracks[source.run, folder] = self._track(source, folder, names)
-        track = self._tracks[source.run, folder]
-        window = _Window(track, [], [])
-        own: dict[str, Any] = {"run": source.run, "walk": self.walks.get(track.key, "")}
-        if track.name is not None:
-            own["sample_id"] = sample_id(track.name, caption.frame_index)
-        for language in self._cfg.languages:
-            sample = make_sample(caption, language, self._cfg, **own)
-            if isinstance(sample, Sample):
-                sample = _unfit(track, sample) or sample
-            if isinstance(sample, Sample):
-                past = _past_of(self._read(folder), sample.window)
-                window.samples.append(sample.model_copy(update={"past": past}))
-            else:
-                window.reasons.append(sample)
-        return window
+    def _sample(
+        self, source: RunSource, place: TrackPlace, key: str, caption: Caption, language: Language
+    ) -> Sample | str:
+        """Return the sample of a caption with the past of its track, or the reason why there is none."""
+        folder = inside(source.data, f"{place.town}/{place.trajectory}/{place.variant}", in_parent=True)
+        if folder not in self._frames:
+            self._frames[folder] = self._frames_of(folder, key, place.town)
+        name = sample_id(self._ids[place], caption.frame_index) if place in self._ids else caption.sample_id
+        own = {"run": source.run, "walk": self.walks.get(key, ""), "sample_id": name}
+        sample = make_sample(caption, language, self._cfg, **own)
+        if isinstance(sample, str):
+            return sample
+        if not self._frames[folder].issuperset(sample.window):
+            return "missing_image"
+        track = self._read(folder)
+        size_px = scaled_size(track.camera.width_px, track.camera.height_px, max(sample.picture_px))
+        if sample.views and size_px != sample.picture_px:
+            return "picture_of_another_size"
+        return sample.model_copy(update={"past": _past_of(track, sample.window)})
 
-    def _track(self, source: RunSource, folder: Path, names: tuple[str, str, str]) -> _CaptionedTrack:
-        key, size_px, frames = f"{source.run}/{names[0]}/{names[1]}", None, frozenset[int]()
-        if (folder / "trajectory.json").exists():
-            track = self._read(folder)
-            self.courses.append(Course(key, names[0], track.time_s, track.walked_m).at_seconds())
-            size_px = (track.camera.width_px, track.camera.height_px)
-            frames = frozenset(
-                index
-                for index in range(len(track))
-                if all(frame_path(folder / frame_name(index), VIEW_FILES[v]).is_file() for v in self._cfg.modalities)
-            )
-        return _CaptionedTrack(key, self._ids.get(TrackPlace(source.run, *names)), size_px, frames)
+    def _frames_of(self, folder: Path, key: str, town: str) -> frozenset[int]:
+        """Return the frames of a track that have all files of the views, and note its course."""
+        if not (folder / "trajectory.json").exists():
+            return frozenset()
+        track, files = self._read(folder), [VIEW_FILES[view] for view in self._cfg.modalities]
+        self.courses.append(Course(key, town, track.time_s, track.walked_m).at_seconds())
+        frames = [folder / frame_name(index) for index in range(len(track))]
+        return frozenset(i for i, frame in enumerate(frames) if all(frame_path(frame, f).is_file() for f in files))
 
 
 def _past_of(track: Track, window: Sequence[int]) -> tuple[float, ...]:
     """Return the geometry of the last frames, for the baselines without pictures."""
     is_ordered = track.mission is not None and track.mission.order_at(window[-1]) is not None
     return tuple(past_of(track, window, is_ordered).round(DIGITS).tolist())
-
-
-def _unfit(track: _CaptionedTrack, sample: Sample) -> str | None:
-    """Return why the frames of a track are not those of a sample; None if they are."""
-    if track.size_px is None or not track.frames.issuperset(sample.window):
-        return "missing_image"
-    fits = not sample.views or scaled_size(*track.size_px, max(sample.picture_px)) == sample.picture_px
-    return None if fits else "picture_of_another_size"
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
@@ -228,7 +207,8 @@ def run(
     Raises:
         NothingKept: no caption can be used. VerifyError: captions are of another tree.
     """
-    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs_of(sources), seed=seed, resume=resume)
+    inputs = tree_inputs([source.data for source in sources], [source.captions for source in sources])
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return out
     check_names([source.run for source in sources])
@@ -247,12 +227,20 @@ def run(
     last_rank = sorted(ranks)[cfg.limit - 1] if 0 < cfg.limit < len(ranks) else max(ranks)
     decisions: dict[Split, Counter[str]] = {split: Counter() for split in SPLITS}
     tracks: dict[Split, set[tuple[str, ...]]] = {split: set() for split in SPLITS}
-    with SplitWriter(out, Sample).writing() as writer:
-        for sample in _selected(windows, last_rank, left_out, seed):
-            split = split_of[f"{sample.run}/{sample.town}/{sample.trajectory}"]
-            decisions[split][sample.decision] += 1
-            tracks[split].add((sample.walk, sample.run, sample.town, sample.trajectory, sample.variant))
-            writer.add(split, sample)
+    with (
+        SplitWriter(out, Sample).writing() as writer,
+        progress_bar(f"{STAGE}: writing", total=None) as advance,
+    ):
+        for window in windows:
+            advance(1)
+            if window.samples and window.rank(seed) > last_rank:
+                left_out["limit"] += len(window.samples)
+                continue
+            for sample in window.samples:
+                split = split_of[window.key]
+                decisions[split][sample.decision] += 1
+                tracks[split].add((sample.walk, window.key, sample.variant))
+                writer.add(split, sample)
     pictured = sources if cfg.modalities else []
     trees = [SourceTree(run=source.run, sha256=fingerprint(source.data)) for source in pictured]
     write_model(out / RECORD, TrainingSet(split_by=cfg.split_by, trees=trees, samples=writer.counts), RECORD_FORMAT)
@@ -261,11 +249,6 @@ def run(
     tally = Tally(input=num_kept + left_out.total(), kept=num_kept, dropped=left_out)
     stage.finish([*writer.paths, out / RECORD, page], tally, splits=_facts(decisions, tracks), split_by=cfg.split_by)
     return out
-
-
-def _rank(window: _Window, seed: int) -> int:
-    """Return a random number of a window with samples, which does not depend on the other windows."""
-    return int.from_bytes(hashlib.sha256(f"{seed}/{STAGE}/{window.samples[0].sample_id}".encode()).digest()[:8])
 
 
 def _survey(windows: _Windows, seed: int) -> tuple[set[int], set[str], Counter[str]]:
@@ -280,24 +263,13 @@ def _survey(windows: _Windows, seed: int) -> tuple[set[int], set[str], Counter[s
             advance(1)
             reasons.update(window.reasons)
             if window.samples:
-                rank = _rank(window, seed)
+                rank = window.rank(seed)
                 if rank in ranks:
                     where, fix = window.samples[0].sample_id, "remove one of the two lines from the captions"
                     raise InputError("two captions are of the same window", where=where, fix=fix)
                 ranks.add(rank)
-                keys.add(window.track.key)
+                keys.add(window.key)
     return ranks, keys, reasons
-
-
-def _selected(windows: _Windows, last_rank: int, left_out: Counter[str], seed: int) -> Iterator[Sample]:
-    """Yield the samples of the windows up to a rank; count the others in `left_out`."""
-    with progress_bar(f"{STAGE}: writing", total=None) as advance:
-        for window in windows:
-            advance(1)
-            if window.samples and _rank(window, seed) > last_rank:
-                left_out["limit"] += len(window.samples)
-            else:
-                yield from window.samples
 
 
 def _facts(
@@ -310,10 +282,7 @@ def _facts(
             log.warning("%s: the split %s is empty", STAGE, split)
         if unseen := {name: count for name, count in own.items() if name not in decisions["train"]}:
             log.warning("%s: %s has decisions that train does not have: %s", STAGE, split, unseen)
-        counts = {
-            "samples": own.total(),
-            "walks": len({walk for walk, *_ in tracks[split]}),
-            "tracks": len(tracks[split]),
-        }
+        counts = {"samples": own.total(), "walks": len({walk for walk, *_ in tracks[split]})}
+        counts["tracks"] = len(tracks[split])
         facts[split] = {**counts, "by_decision": dict(sorted(own.items())), "not_in_train": unseen}
     return facts

@@ -26,15 +26,7 @@ IGNORED = -100  # label of tokens without a loss, the convention of PyTorch's cr
 MARKUP = re.compile(r"[<\[|].+[>\]|]")  # tokens such as <think>, [INST], <|im_end|>
 
 
-@dataclass(frozen=True)
-class AnswerWeights:
-    """Weights of the tokens of an answer in the loss: of the decision, of the reason, of all others 1."""
-
-    decision: float = 1.0
-    reason: float = 1.0
-
-
-PLAIN_WEIGHTS = AnswerWeights()
+FieldWeights = Mapping[str, float]  # field of an answer -> weight of its tokens in the loss; of all others 1
 
 
 @dataclass(frozen=True)
@@ -81,13 +73,12 @@ class _BySize:
 class Processor:
     """Turns texts and pictures into tensors; it has no model, so worker processes can hold it.
 
-    library: transformers' processor of a family with pictures; None: a text-only student. picture_token_id: the token
-    whose place features of pictures take. template: chat template that replaces the student's own; empty: none.
+    library: transformers' processor of a family with pictures; None: a text-only student. template: chat template
+    that replaces the student's own; empty: none.
     """
 
     tokenizer: Any
     library: Any
-    picture_token_id: int | None = None
     template: str = ""
 
     @property
@@ -192,7 +183,7 @@ class Processor:
         blank = Image.new("RGB", size_px)
         return self._sized(text=[text], images=[[blank] * count], add_special_tokens=False)
 
-    def encode(self, sample: Sample, max_pixels: int = 0, weights: AnswerWeights = PLAIN_WEIGHTS) -> EncodedSample:
+    def encode(self, sample: Sample, max_pixels: int = 0, weights: FieldWeights | None = None) -> EncodedSample:
         """Return the tokens of a sample.
 
         Args:
@@ -211,7 +202,7 @@ class Processor:
         return EncodedSample(
             prompt_ids=ids,
             answer_ids=np.array([*answer["input_ids"], self.end_token_id], dtype=np.int64),
-            weights=sample.weight * _token_weights(text, answer, weights),
+            weights=_token_weights(text, answer, weights or {}),
             kinds=np.zeros_like(ids) if kinds is None else np.array(kinds[0], dtype=np.int64),
         )
 
@@ -226,13 +217,6 @@ class Processor:
     @cached_property
     def _picture_text(self) -> str:
         return self._render([{"role": "user", "content": [IMAGE_PART, {"type": "text", "text": "x"}]}])
-
-    def picture_tokens(self, size_px: tuple[int, int]) -> int:
-        """Return how many tokens a picture of (width, height) px takes in training, inference and a server."""
-        if not self.has_pictures:
-            return 0
-        ids = self._tokens(self._picture_text, size_px, 1)["input_ids"][0]
-        return ids.count(self.picture_token_id)
 
     def picture_inputs(self, picture: np.ndarray, *, is_alone: bool) -> dict[str, np.ndarray]:
         """Return a picture, (h, w, 3) uint8, as the inputs that the model takes of it.
@@ -249,24 +233,16 @@ class Processor:
         return {name: np.asarray(value) for name, value in found.items() if name not in of_text}
 
 
-def _token_weights(text: str, tokens: Mapping[str, Any], weights: AnswerWeights) -> np.ndarray:
+def _token_weights(text: str, tokens: Mapping[str, Any], weights: FieldWeights) -> np.ndarray:
     """Return the weight of each token of an answer and of its end token, (m,) float32."""
     found = np.ones(len(tokens["input_ids"]) + 1, dtype=np.float32)
-    for field, weight in (("flight_decision", weights.decision), ("reasoning_trace", weights.reason)):
-        span = _span_of(text, field) if weight != 1.0 else None
-        if span is not None and "offset_mapping" in tokens:
+    for field, weight in weights.items():
+        key = re.search(rf'"{field}"\s*:\s*"', text)
+        if key is not None and "offset_mapping" in tokens:
+            _, end = json.JSONDecoder().raw_decode(text, key.end() - 1)  # behind the closing quotation mark
             begins, ends = np.array(tokens["offset_mapping"]).reshape(-1, 2).T
-            found[:-1][(ends > span[0]) & (begins < span[1])] = weight
+            found[:-1][(ends > key.end()) & (begins < end - 1)] = weight
     return found
-
-
-def _span_of(text: str, field: str) -> tuple[int, int] | None:
-    """Return the characters (begin, end) of the value of a field in the JSON text of an answer."""
-    key = re.search(rf'"{field}"\s*:\s*"', text)
-    if key is None:
-        return None
-    _, end = json.JSONDecoder().raw_decode(text, key.end() - 1)
-    return key.end(), end - 1
 
 
 def load_pictures(sample: Sample, trees: Mapping[str, Path]) -> list[np.ndarray]:

@@ -214,19 +214,6 @@ def _picture_processor(config: Any, tokenizer: Any, arguments: dict[str, Any]) -
     return PictureProcessor(image_processor=images, tokenizer=tokenizer, **settings)
 
 
-def _check_is_whole(model: Any, adapter: Path) -> None:
-    """Check that an adapter has each of its tensors: peft leaves a missing one at zero without an error."""
-    from safetensors import safe_open
-
-    with safe_open(adapter / "adapter_model.safetensors", framework="pt") as file:
-        num_found = len(list(file.keys()))
-    num_wanted = sum("lora_" in name for name, _ in model.named_parameters())
-    if num_found != num_wanted:
-        got, expected = f"{num_found} tensors", str(num_wanted)
-        fix = "pass the base model of this adapter, or the whole adapter"
-        raise InputError("the adapter does not fit the model", where=adapter, got=got, expected=expected, fix=fix)
-
-
 def load_student(
     path: Path,
     *,
@@ -264,8 +251,7 @@ def load_student(
             library = _picture_processor(config, tokenizer, arguments)
     if not template and adapter is not None and (adapter / TEMPLATE).is_file():
         template = read_text(adapter / TEMPLATE, what="chat template")
-    token = getattr(config, "image_token_id", None) or getattr(config, "image_token_index", None)
-    Processor(tokenizer, library, token, template).check(path)
+    Processor(tokenizer, library, template).check(path)
     family = importlib.import_module(FAST_FAMILIES[config.model_type]) if config.model_type in FAST_FAMILIES else None
     if family is not None:
         family.choose_kernels(computed, device_name)
@@ -280,9 +266,8 @@ def load_student(
             if not (adapter / "adapter_model.safetensors").is_file():
                 raise InputError("the folder is not an adapter", where=adapter, expected="adapter_model.safetensors")
             model = PeftModel.from_pretrained(model, adapter)
-            _check_is_whole(model, adapter)
     model.to(device_name)
-    student = Student(tokenizer, library, token, template, model=model, device=device_name, dtype=computed)
+    student = Student(tokenizer, library, template, model=model, device=device_name, dtype=computed)
     if family is not None and device_name == "cuda":
         family.fuse_norms(student.core)
     return student

@@ -97,8 +97,8 @@ def base_digests(model: Path) -> dict[str, str]:
     return {path.name: sha256_file(path) for path in weight_files(model).values() if path.suffix in suffixes}
 
 
-def check_adapter(adapter: Path, model: Path) -> None:
-    """Check that a folder has an adapter of a model."""
+def check_adapter(adapter: Path, model: Path) -> dict[str, Path]:
+    """Check that a folder has an adapter of a model; return its files, for the inputs of a stage."""
     path = adapter / ADAPTER_FACTS
     if not path.is_file() or not (adapter / CHAT_FORMAT_FILE).is_file():
         expected = f"{ADAPTER_FACTS} and {CHAT_FORMAT_FILE} of a finished cosfly distill train"
@@ -107,3 +107,4 @@ def check_adapter(adapter: Path, model: Path) -> None:
     if wanted != found:
         got, expected, fix = str(found)[:120], str(wanted)[:120], "pass the base model of this adapter"
         raise InputError("the adapter was trained on another model", where=path, got=got, expected=expected, fix=fix)
+    return {f"adapter/{file.name}": file for file in sorted(adapter.iterdir()) if file.is_file()}

@@ -11,7 +11,8 @@ import logging
 import math
 import resource
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +97,7 @@ def train_step(context: TrainingContext, optimizer: Any, rows: Rows, rate: float
     own_nats = 0.0
     for start in range(0, len(rows), cfg.batch_size):
         batch = rows[start : start + cfg.batch_size]
-        nats, _ = answer_loss(student, [row for row, _ in batch], context.features_of(batch), LOGIT_CHUNK)
+        nats = answer_loss(student, [row for row, _ in batch], context.features_of(batch), LOGIT_CHUNK)
         nats.backward()
         own_nats += float(nats.detach())
     encoded = [row for row, _ in rows]
@@ -146,11 +147,13 @@ def fit(context: TrainingContext, out: Path) -> Progress:
         raise ResumeError("other samples can be used than when the training began", where=out, fix=fix)
     if progress.step:
         log.info("%s: resumed after step %d", STAGE, progress.step)
-    with _open_log(context, out / LOG, progress.step if newest else -1) as note:
-        if newest is None:
-            validate(context, progress, note)
-        if not progress.has_ended:
-            progress = _take_steps(context, optimizer, progress, folder, note)
+    if accelerator.is_main_process:
+        cut_log(out / LOG, progress.step if newest else -1)
+    note = partial(_note, context, out / LOG)
+    if newest is None:
+        validate(context, progress, note)
+    if not progress.has_ended:
+        progress = _take_steps(context, optimizer, progress, folder, note)
     if accelerator.is_main_process:  # again, because a kill may have come in the middle of it
         drop_old_checkpoints(folder, progress, cfg.keep_checkpoints)
     accelerator.wait_for_everyone()
@@ -212,8 +215,8 @@ def validate(context: TrainingContext, progress: Progress, note: Note) -> Progre
     with torch.no_grad(), progress_bar(f"{STAGE}: validation", total=len(order)) as advance:
         for rows in split.rows(batches, num_workers(cfg.data_workers, len(order))):
             encoded = [row for row, _ in rows]
-            total, _ = answer_loss(context.student, encoded, context.features_of(rows), LOGIT_CHUNK)
-            nats, weight = nats + float(total), weight + sum(float(row.weights.sum()) for row in encoded)
+            nats += float(answer_loss(context.student, encoded, context.features_of(rows), LOGIT_CHUNK))
+            weight += sum(float(row.weights.sum()) for row in encoded)
             advance(len(rows))
     nats, weight = context.total([nats, weight])
     note({"step": progress.step, "validation": {"samples": len(split.used), "loss": nats / weight}})
@@ -241,33 +244,12 @@ def used_gb(device: str) -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
 
 
-@contextlib.contextmanager
-def _open_log(context: TrainingContext, path: Path, num_steps: int) -> Iterator[Note]:
-    """Yield a function that appends a record to the log and sends its numbers to the loggers of `report_to`.
-
-    Args:
-        num_steps: steps whose lines are kept. Only the first process writes.
-    """
+def _note(context: TrainingContext, path: Path, record: dict[str, Any]) -> None:
+    """Append a record to the log, and send its numbers to the loggers of `report_to`."""
     if not context.accelerator.is_main_process:
-        yield lambda record: None
         return
-    cut_log(path, num_steps)
     with storage_errors(path), open(path, "a", encoding="utf-8") as file:
-
-        def note(record: dict[str, Any]) -> None:
-            file.write(dump_json(record) + "\n")
-            file.flush()
-            context.accelerator.log(_numbers_of(record), step=record["step"])
-
-        yield note
-
-
-def _numbers_of(record: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
-    """Return the numbers of a record by name, those of inner records as `outer/inner`."""
-    found: dict[str, float] = {}
-    for name, value in record.items():
-        if isinstance(value, Mapping):
-            found |= _numbers_of(value, f"{prefix}{name}/")
-        elif isinstance(value, int | float) and name != "step":
-            found[f"{prefix}{name}"] = float(value)
-    return found
+        file.write(dump_json(record) + "\n")
+    parts = {name: part if isinstance(part, dict) else {"": part} for name, part in record.items() if name != "step"}
+    numbers = {f"{name}/{inner}".rstrip("/"): value for name, part in parts.items() for inner, value in part.items()}
+    context.accelerator.log(numbers, step=record["step"])

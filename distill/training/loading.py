@@ -16,7 +16,7 @@ from cosfly.runtime.errors import CosflyError
 from cosfly.runtime.limits import num_cpus
 from cosfly.runtime.worker import end_with_parent
 from distill.schema import Sample
-from distill.student.chat import AnswerWeights, EncodedSample, Processor, special_token_in
+from distill.student.chat import EncodedSample, FieldWeights, Processor, special_token_in
 from distill.student.features import FramePicture, PictureReader, Tensors, encode, pictures_of, read_features
 from distill.student.model import Student
 from distill.training.settings import STAGE, TrainConfig
@@ -101,7 +101,7 @@ class TrainingSplit:
     samples: Sequence[Sample]
     processor: Processor
     max_pixels: int
-    weights: AnswerWeights
+    weights: FieldWeights
     used: list[SampleTokens] = field(default_factory=list)
     skipped: list[SampleTokens] = field(default_factory=list)
 

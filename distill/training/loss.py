@@ -24,12 +24,10 @@ def _chunked_loss() -> Any:
     import torch
 
     class ChunkedLoss(torch.autograd.Function):
-        """nats (n,) of targets under softmax(hidden @ head.T), and weight @ nats, which alone has a gradient."""
+        """weights @ nats of targets under softmax(hidden @ head.T)."""
 
         @staticmethod
-        def forward(
-            ctx: Any, hidden: Any, head: Any, targets: Any, weights: Any, chunk: int, dtype: Any
-        ) -> tuple[Any, Any]:
+        def forward(ctx: Any, hidden: Any, head: Any, targets: Any, weights: Any, chunk: int, dtype: Any) -> Any:
             wants_hidden, wants_head = ctx.needs_input_grad[:2]
             head_used = head.to(dtype)
             nats = torch.empty(len(targets), dtype=torch.float32, device=hidden.device)
@@ -53,11 +51,10 @@ def _chunked_loss() -> Any:
                     head_gradient += (gradient.T @ used).float()
             ctx.save_for_backward(hidden_gradient, head_gradient)
             ctx.head_dtype = head.dtype
-            ctx.mark_non_differentiable(nats)
-            return (weights * nats).sum(), nats
+            return (weights * nats).sum()
 
         @staticmethod
-        def backward(ctx: Any, total_gradient: Any, _: Any) -> tuple[Any, ...]:
+        def backward(ctx: Any, total_gradient: Any) -> tuple[Any, ...]:
             hidden_gradient, head_gradient = ctx.saved_tensors
             for_hidden = None if hidden_gradient is None else hidden_gradient * total_gradient
             for_head = None if head_gradient is None else (head_gradient * total_gradient).to(ctx.head_dtype)
@@ -66,18 +63,15 @@ def _chunked_loss() -> Any:
     return ChunkedLoss
 
 
-def chunked_loss(hidden: Any, head: Any, targets: Any, weights: Any, *, chunk: int, dtype: Any) -> tuple[Any, Any]:
-    """Compute the weighted negative log-likelihood of tokens.
+def chunked_loss(hidden: Any, head: Any, targets: Any, weights: Any, *, chunk: int, dtype: Any) -> Any:
+    """Return the weighted negative log-likelihood of tokens, which can be differentiated by hidden and head.
 
     Args:
         hidden: (n, width), what the network says before its head. head: (vocabulary, width).
         targets: (n,) int64, the tokens. weights: (n,) float32.
         chunk: tokens whose logits exist at a time. dtype: what the products are computed in; the rest is float32.
-    Returns:
-        weights @ nats, which can be differentiated by hidden and head; and the nats (n,), which cannot.
     """
-    total, nats = _chunked_loss().apply(hidden, head, targets, weights, chunk, dtype)
-    return total, nats.detach()
+    return _chunked_loss().apply(hidden, head, targets, weights, chunk, dtype)
 
 
 def output_head(student: Student) -> Any:
@@ -91,15 +85,11 @@ def output_head(student: Student) -> Any:
     return head.weight
 
 
-def answer_loss(
-    student: Student, rows: Sequence[EncodedSample], pictures: Sequence[Tensors], chunk: int
-) -> tuple[Any, Any]:
-    """Run samples forward, padded on the right.
+def answer_loss(student: Student, rows: Sequence[EncodedSample], pictures: Sequence[Tensors], chunk: int) -> Any:
+    """Run samples forward, padded on the right, and return the sum over all answer tokens of weight times nats.
 
     Args:
         pictures: features of the pictures of all rows, row after row.
-    Returns:
-        The sum over all answer tokens of weight times nats, differentiable; and (b,) the unweighted nats of each row.
     """
     import torch
 
@@ -108,16 +98,8 @@ def answer_loss(
     with student.computing(), shown(student, pictures) as inputs:
         hidden = student.core.base_model(**given, **inputs, use_cache=False).last_hidden_state
     is_target = labels != IGNORED  # the token at i is predicted at i - 1
-    total, nats = chunked_loss(
-        hidden[:, :-1][is_target],
-        output_head(student),
-        labels[is_target],
-        weights[is_target],
-        chunk=chunk,
-        dtype=student.dtype,
-    )
-    row_of = is_target.nonzero()[:, 0]
-    return total, torch.zeros(len(rows), device=student.device).index_add_(0, row_of, nats)
+    found = hidden[:, :-1][is_target], output_head(student), labels[is_target], weights[is_target]
+    return chunked_loss(*found, chunk=chunk, dtype=student.dtype)
 
 
 def check_head(student: Student) -> None:

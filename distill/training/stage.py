@@ -23,7 +23,7 @@ from cosfly.runtime.io import atomic_folder, read_text
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.runtime.seeding import rng_for
 from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
-from distill.student.chat import AnswerWeights, check_template
+from distill.student.chat import check_template
 from distill.student.features import PictureReader
 from distill.student.model import Student, is_hub_name, load_student, pick_device, require, student_path, weight_files
 from distill.student.random_student import RANDOM, TINY, TINY_STUDENT, make_random_student
@@ -53,20 +53,16 @@ def taught_by(samples: Iterable[Sample], max_pixels: int) -> ChatFormat:
     lengths: set[int] = set()
     decision: Place = "last"
     for sample in samples:
-        decision = decision_place(sample.answer)
         prompts.setdefault(sample.language, sample.prompt)
         looks.add(FrameFormat(views=sample.views, size_px=sample.picture_px, depth_range_m=sample.depth_range_m))
         lengths.add(len(sample.frames))
+        decision = decision_place(sample.answer)
     if len(lengths) != 1:
         raise InputError("the training set has windows of different lengths", got=f"{sorted(lengths)} frames")
     ordered = sorted(looks, key=lambda look: (look.views, look.size_px, look.depth_range_m))
-    return ChatFormat(
-        prompts=dict(sorted(prompts.items())),
-        num_frames=lengths.pop(),
-        looks=ordered,
-        max_pixels=max_pixels or max(math.prod(look.size_px) for look in ordered),
-        decision=decision,
-    )
+    limit = max_pixels or max(math.prod(look.size_px) for look in ordered)
+    prompts = dict(sorted(prompts.items()))
+    return ChatFormat(prompts=prompts, num_frames=lengths.pop(), looks=ordered, max_pixels=limit, decision=decision)
 
 
 def add_adapter(student: Student, cfg: TrainConfig, seed: int) -> Student:
@@ -227,7 +223,11 @@ def run(
         base = out / STUDENT if random_student else student_path(str(student), allow_code=cfg.allow_code)
         if random_student is not None:
             cfg = cfg.model_copy(update={"random_student": random_student})
-        inputs = {"dataset": dataset, **tree_inputs(trees), **({} if random_student else weight_files(base))}
+        inputs = {
+            "dataset": dataset,
+            **tree_inputs(trees.values()),
+            **({} if random_student else weight_files(base)),
+        }
         opened: list[StageFolder] = []
 
         def begin() -> bool:
@@ -278,7 +278,7 @@ def _context(
     check_template(student, samples[0])
     check_head(student)
     taught_by(samples, cfg.max_pixels)  # its errors come before the training
-    weights = AnswerWeights(cfg.decision_weight, cfg.reason_weight)
+    weights = {"flight_decision": cfg.decision_weight, "reasoning_trace": cfg.reason_weight}
     train, val = (TrainingSplit(part, student, cfg.max_pixels, weights) for part in (samples, validation))
     order = rng_for(seed, STAGE, "validation").permutation(len(validation))
     train.count(range(len(samples)), cfg.max_tokens, cfg.data_workers)

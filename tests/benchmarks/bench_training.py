@@ -75,9 +75,6 @@ class MadeUp(Student):
 
     end_token_id, kinds_name = END, "mm_token_type_ids"
 
-    def picture_tokens(self, size_px: tuple[int, int]) -> int:
-        return size_px[0] * size_px[1] // 1024
-
 
 def make_student(shape: str, device: str, dtype: Any, seed: int = 0) -> Student:
     choose_kernels(dtype, device)
@@ -103,7 +100,7 @@ def make_student(shape: str, device: str, dtype: Any, seed: int = 0) -> Student:
     torch.manual_seed(seed)
     with torch.device(device):
         model = Qwen3_5ForConditionalGeneration(config).to(dtype)
-    return MadeUp(Words(), "made up", IMAGE, model=model, device=device, dtype=dtype)
+    return MadeUp(Words(), "made up", model=model, device=device, dtype=dtype)
 
 
 def make_text_student(shape: str, device: str, dtype: Any, seed: int) -> Student:
@@ -160,7 +157,7 @@ def backward(student: Student, way: str, rows: list, features: dict[FramePicture
         with torch.no_grad():
             found = encode(student, [noise_of(picture, student.dtype) for picture in new])
         features |= {p: {n: t.cpu() for n, t in one.items()} for p, one in zip(new, found, strict=True)}
-        loss, _ = answer_loss(student, encoded, [features[picture] for picture in pictures], ANSWER_TOKENS)
+        loss = answer_loss(student, encoded, [features[picture] for picture in pictures], ANSWER_TOKENS)
     loss.backward()
     return float(loss.detach())
 
