@@ -6,11 +6,9 @@ tensors. It is a map-style data set that pickles; each worker opens the files ag
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, NamedTuple, TypedDict
 
 import cv2
 import numpy as np
@@ -25,26 +23,18 @@ from cosfly.runtime.png import colours_of
 from cosfly.runtime.tables import TableRows, open_table, rows_of
 from cosfly.viz.frame_views import Pictures, scaled_size
 
-# The facts of a frame, as the columns of a release are called: members of a struct, "" for a number.
+# The facts of a frame, as the columns of a release are called: members of a struct, none for a number.
+XYZ, BOX = ("x_m", "y_m", "z_m"), ("xmin_px", "ymin_px", "xmax_px", "ymax_px")
 FACTS: dict[str, tuple[str, ...]] = {
-    "time_s": ("",),
-    "pose": ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg"),
-    "intrinsics": ("fx", "fy", "cx", "cy"),
-    "target": ("x_m", "y_m", "z_m"),
-    "target_uv": ("u_px", "v_px"),
-    "target_bbox": ("xmin_px", "ymin_px", "xmax_px", "ymax_px"),
-    "target_mask_bbox": ("xmin_px", "ymin_px", "xmax_px", "ymax_px"),
-    "target_depth_m": ("",),
-    "target_in_view": ("",),
-    "target_visible": ("",),
-    "visibility": ("",),
-}
+    "time_s": (), "pose": (*XYZ, "pitch_deg", "yaw_deg", "roll_deg"), "intrinsics": ("fx", "fy", "cx", "cy"),
+    "target": XYZ, "target_uv": ("u_px", "v_px"), "target_bbox": BOX, "target_mask_bbox": BOX, "target_depth_m": (),
+    "target_in_view": (), "target_visible": (), "visibility": (),
+}  # fmt: skip
 FLAGS = ("target_in_view", "target_visible")
 PLACE = ("run", "town", "trajectory", "variant")
 # Types of the columns; all others are texts.
 TYPES: dict[str, pa.DataType] = {
-    **{name: pa.struct([(m, pa.float64()) for m in members]) for name, members in FACTS.items() if len(members) > 1},
-    **{name: pa.float64() for name, members in FACTS.items() if len(members) == 1},
+    **{name: pa.struct([(m, pa.float64()) for m in own]) if own else pa.float64() for name, own in FACTS.items()},
     **dict.fromkeys(FLAGS, pa.bool_()),
     **dict.fromkeys(("caption_window", "caption_picture_px"), pa.list_(pa.int32())),
     "image": pa.struct([("bytes", pa.binary()), ("path", pa.string())]),
@@ -70,8 +60,7 @@ class WindowData(TypedDict):
     caption: dict[str, str]
 
 
-@dataclass(frozen=True)
-class WindowPlace:
+class WindowPlace(NamedTuple):
     """A window before it is read: its track, its frames, and the numbers of their rows in a shard."""
 
     sample_id: str
@@ -108,16 +97,14 @@ class WindowDataset(Sequence[WindowData]):
         texts = [f"caption_{language}_{field}" for field in FIELDS]
         prompts = [f"system_{language}", f"prompt_{language}"]
         self._columns = ["image", *FACTS, *texts, *prompts, "caption_picture_px", "label", "verdict"]
-        self.left_out = Counter[str]()  # captions without a window, by reason
         self._shards = [TableRows(inside(self.folder, name), self._columns) for name in names]
         self._places = [
             place for number, name in enumerate(names) for place in self._places_in(number, inside(self.folder, name))
         ]
         if not self._places:
-            why = ", ".join(f"{reason} {count}" for reason, count in self.left_out.items()) or "no captions"
             what, expected = "the source has no usable window", f"accepted captions in {language!r} whose frames exist"
             fix = "build the release with --set release.selection=windows, which keeps consecutive frames"
-            raise InputError(what, where=source, got=why, expected=expected, fix=fix)
+            raise InputError(what, where=source, expected=expected, fix=fix)
 
     def _places_in(self, shard: int, path: Path) -> Iterator[WindowPlace]:
         """Yield the windows of a shard, which contains whole tracks."""
@@ -133,13 +120,9 @@ class WindowDataset(Sequence[WindowData]):
             rows.setdefault(flight, {})[row["frame_index"]] = number
             if row[text] and row["caption_window"]:
                 captioned.append((flight, row["sample_id"], tuple(row["caption_window"])))
-            elif row["caption_window"]:
-                self.left_out[f"no_{self.language}"] += 1
         for flight, sample_id, window in captioned:
             if rows[flight].keys() >= set(window):
                 yield WindowPlace(sample_id, flight, window, shard, tuple(rows[flight][index] for index in window))
-            else:
-                self.left_out["missing_frame"] += 1
 
     def __len__(self) -> int:
         return len(self._places)
@@ -151,7 +134,11 @@ class WindowDataset(Sequence[WindowData]):
         system, user = last[f"system_{language}"], last[f"prompt_{language}"]
         if not isinstance(system, str) or not isinstance(user, str):
             raise InputError("the caption has no prompt", where=place.sample_id)
-        frames = [_picture(row, place.sample_id) for row in rows]
+        pictures = [row["image"] and row["image"]["bytes"] for row in rows]
+        if not all(pictures):
+            fix = "download the release with --modality rgb"
+            raise InputError("a frame has no picture", where=place.sample_id, fix=fix)
+        frames = [colours_of(picture, place.sample_id) for picture in pictures]
         if len({frame.shape for frame in frames}) != 1:
             raise InputError("the frames of a window differ in size", where=place.sample_id)
         height_px, width_px = frames[0].shape[:2]
@@ -159,15 +146,15 @@ class WindowDataset(Sequence[WindowData]):
         size = scaled_size(width_px, height_px, max(picture_px))
         if size != (width_px, height_px):
             frames = [cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames]
-        pictures = Pictures(("rgb",), (picture_px[0], picture_px[1])).sentence(language)
+        sentence = Pictures(("rgb",), (picture_px[0], picture_px[1])).sentence(language)
         caption = {field: last[f"caption_{language}_{field}"] or "" for field in FIELDS}
         return WindowData(
             sample_id=place.sample_id,
             flight="/".join(place.flight),
             window=np.array(place.window, dtype=np.int64),
             frames=np.ascontiguousarray(np.stack(frames).transpose(0, 3, 1, 2)),
-            facts={name: _column(rows, name, members) for name, members in FACTS.items()},
-            prompt=Prompt(system=system, user=user).told(pictures).model_dump(),
+            facts={name: _column(rows, name) for name in FACTS},
+            prompt=Prompt(system=system, user=user).told(sentence).model_dump(),
             caption=caption | {name: last[name] or "" for name in ("label", "verdict")},
         )
 
@@ -200,17 +187,8 @@ def _check_columns(path: Path, tree: Path, wanted: Sequence[str]) -> None:
         raise InputError("columns are missing or have the wrong type", where=path, got=wrong[:200], fix=fix)
 
 
-def _picture(row: Mapping[str, Any], where: str) -> np.ndarray:
-    data = row["image"] and row["image"]["bytes"]
-    if not data:
-        raise InputError("the frame has no picture", where=where, fix="download the release with --modality rgb")
-    return colours_of(data, where)
-
-
-def _column(rows: Sequence[Mapping[str, Any]], name: str, members: tuple[str, ...]) -> np.ndarray:
-    if name in FLAGS:
-        return np.array([bool(row[name]) for row in rows])
-    if members == ("",):
-        return np.array([np.nan if row[name] is None else row[name] for row in rows], dtype=np.float64)
-    nothing = dict.fromkeys(members, np.nan)
-    return np.array([[(row[name] or nothing)[member] for member in members] for row in rows], dtype=np.float64)
+def _column(rows: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
+    """Return a fact of some frames, (k, members) or (k,); None becomes NaN or False."""
+    members = FACTS[name]
+    values = [[(row[name] or {}).get(member) for member in members] if members else row[name] for row in rows]
+    return np.array(values, dtype=bool if name in FLAGS else np.float64)

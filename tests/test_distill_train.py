@@ -31,10 +31,11 @@ from cosfly.formats.predictions import read_predictions
 from cosfly.llm.student_chat import read_chat_format
 from cosfly.runtime.errors import ConfigError
 from distill.inference import stage as infer
+from distill.student import features
 from distill.student import model as student
 from distill.student.chat import IGNORED, load_pictures, padded
 from distill.student.random_student import END_OF_TURN
-from distill.training import fit
+from distill.training import fit, loading
 from distill.training import stage as train
 from distill.training.checkpoints import Progress, load_checkpoint, newest_checkpoint
 from distill.training.fit import judged
@@ -122,9 +123,7 @@ def test_loss_falls_and_the_log_tells_how_fast(trained):
     assert sorted(path.name for path in found) == [f"step_{step:08d}" for step in sorted({best, 10, 12})]
     for line in (trained / "log.jsonl").read_text().splitlines():
         speed = json.loads(line).get("speed")
-        assert speed is None or (
-            speed["tokens_per_s"] > 0 and speed["memory_gb"] > 0 and 0 <= speed["waited_share"] <= 1
-        )
+        assert speed is None or (speed["tokens_per_s"] > 0 and speed["memory_gb"] > 0)
 
 
 def test_the_product_holds_no_pickle_and_no_local_path(place, trained):
@@ -291,7 +290,7 @@ def test_a_loss_that_is_no_number_leaves_the_last_good_checkpoint(place, tmp_pat
 WORKERS = """
 import os, time
 from distill.training.loading import in_order
-for pid, _ in in_order(lambda order: (os.getpid(), bytes(10_000_000)), range(100), 2):
+for pid, _ in in_order(lambda order: (os.getpid(), bytes(10_000_000)), range(200), 2):
     print(pid, flush=True)
     time.sleep(0.5)
 """
@@ -308,6 +307,17 @@ def test_workers_end_with_a_training_that_was_killed(tmp_path):
         assert len(workers) == 2
         process.kill()
     wait_until(lambda: not any(map(is_running, workers)))
+
+
+@pytest.mark.parametrize("settings", [{}, {"method": "full", "train_vision": True, "learning_rate": 1e-3}])
+def test_features_that_do_not_fit_into_the_memory_are_computed_again(place, tmp_path, monkeypatch, caplog, settings):
+    """With the same losses; the first pictures that are read together are kept."""
+    run(place, tmp_path / "whole", max_steps=3, **settings)
+    monkeypatch.setattr(features, "READ_TOGETHER", 8)
+    monkeypatch.setattr(loading, "memory_bytes", lambda: 1)
+    run(place, tmp_path / "little", max_steps=3, **settings)
+    assert "do not fit into the memory: they are encoded at each use" in caplog.text
+    assert log_of(tmp_path / "little") == log_of(tmp_path / "whole")
 
 
 def test_samples_are_left_out_with_a_reason_and_counted(place, tmp_path, caplog):

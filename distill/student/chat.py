@@ -33,8 +33,8 @@ FieldWeights = Mapping[str, float]  # field of an answer -> weight of its tokens
 class EncodedSample:
     """The tokens of a sample.
 
-    prompt_ids (n,), answer_ids (m,) int64, the end token included in the answer. weights (m,) float32: in the loss.
-    kinds (n,) int64: which tokens of the prompt are pictures, for families that want to know; 0 for others.
+    prompt_ids (n,), answer_ids (m,) int32, the end token included in the answer. weights (m,) float32: in the loss.
+    kinds (n,) int8: which tokens of the prompt are pictures, for families that want to know; 0 for others.
     """
 
     prompt_ids: np.ndarray
@@ -44,6 +44,10 @@ class EncodedSample:
 
     def __len__(self) -> int:
         return len(self.prompt_ids) + len(self.answer_ids)
+
+    @property
+    def weight(self) -> float:
+        return float(self.weights.sum())
 
 
 class _BySize:
@@ -197,13 +201,13 @@ class Processor:
             raise InputError("the prompt cannot be encoded", where=sample.key, got=str(error)[:200], fix=fix) from error
         text = self.lead + sample.answer
         answer = self.tokenizer(text, add_special_tokens=False, return_offsets_mapping=self.tokenizer.is_fast)
-        ids = np.array(found["input_ids"][0], dtype=np.int64)
+        ids = np.array(found["input_ids"][0], dtype=np.int32)
         kinds = found.get(self.kinds_name) if sample.images else None
         return EncodedSample(
             prompt_ids=ids,
-            answer_ids=np.array([*answer["input_ids"], self.end_token_id], dtype=np.int64),
+            answer_ids=np.array([*answer["input_ids"], self.end_token_id], dtype=np.int32),
             weights=_token_weights(text, answer, weights or {}),
-            kinds=np.zeros_like(ids) if kinds is None else np.array(kinds[0], dtype=np.int64),
+            kinds=np.zeros(len(ids), np.int8) if kinds is None else np.array(kinds[0], dtype=np.int8),
         )
 
     @cached_property
@@ -300,7 +304,8 @@ def prompt_batch(processor: Processor, rows: Sequence[EncodedSample]) -> dict[st
 
 
 def _stacked(rows: Sequence[np.ndarray], fill: int, *, is_left: bool = False) -> np.ndarray:
-    """Pad rows to the longest one."""
+    """Pad rows to the longest one; whole numbers become int64, as PyTorch wants them."""
     counts = [max(map(len, rows)) - len(row) for row in rows]
     pads = [(count, 0) if is_left else (0, count) for count in counts]
-    return np.stack([np.pad(row, pad, constant_values=fill) for row, pad in zip(rows, pads, strict=True)])
+    found = np.stack([np.pad(row, pad, constant_values=fill) for row, pad in zip(rows, pads, strict=True)])
+    return found if found.dtype == np.float32 else found.astype(np.int64)

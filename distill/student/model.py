@@ -146,7 +146,16 @@ def loading_errors(what: str, where: Path) -> Iterator[None]:
 
     try:
         yield
-    except (ImportError, LookupError, OSError, RuntimeError, TypeError, ValueError, SafetensorError) as error:
+    except (
+        ImportError,
+        LookupError,
+        OSError,
+        RuntimeError,
+        TypeError,
+        UserWarning,
+        ValueError,
+        SafetensorError,
+    ) as error:
         got = " ".join(str(error).split())[:300] or type(error).__name__
         fix = "update transformers, use another student, or set allow_code=true if you trust the code that it needs"
         if where.suffix == GGUF:
@@ -265,7 +274,9 @@ def load_student(
         if adapter is not None:
             if not (adapter / "adapter_model.safetensors").is_file():
                 raise InputError("the folder is not an adapter", where=adapter, expected="adapter_model.safetensors")
-            model = PeftModel.from_pretrained(model, adapter)
+            with warnings.catch_warnings():
+                warnings.filterwarnings("error", message=".*missing adapter keys")  # which stay at zero
+                model = PeftModel.from_pretrained(model, adapter)
     model.to(device_name)
     student = Student(tokenizer, library, template, model=model, device=device_name, dtype=computed)
     if family is not None and device_name == "cuda":

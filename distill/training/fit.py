@@ -32,7 +32,7 @@ from distill.training.checkpoints import (
     newest_checkpoint,
     save_checkpoint,
 )
-from distill.training.loading import Rows, TrainingContext, num_workers
+from distill.training.loading import TrainingContext, TrainingSample
 from distill.training.loss import answer_loss
 from distill.training.settings import (
     LOGIT_CHUNK,
@@ -83,8 +83,10 @@ def add_gradients(parameters: Sequence[Any], accelerator: Any) -> None:
         torch.distributed.all_reduce(parameter.grad)
 
 
-def train_step(context: TrainingContext, optimizer: Any, rows: Rows, rate: float) -> dict[str, Any]:
-    """Take one optimizer step over the rows of all processes, `batch_size` samples at a time.
+def train_step(
+    context: TrainingContext, optimizer: Any, chosen: Sequence[TrainingSample], rate: float
+) -> dict[str, Any]:
+    """Take one optimizer step over the samples of all processes, `batch_size` samples at a time.
 
     Returns:
         loss (nats per answer token, weighted), gradient_norm, answer_tokens, tokens, samples: of all processes.
@@ -95,14 +97,13 @@ def train_step(context: TrainingContext, optimizer: Any, rows: Rows, rate: float
     student.model.train()
     parameters = list(learning_weights(student).values())
     own_nats = 0.0
-    for start in range(0, len(rows), cfg.batch_size):
-        batch = rows[start : start + cfg.batch_size]
-        nats = answer_loss(student, [row for row, _ in batch], context.features_of(batch), LOGIT_CHUNK)
+    for start in range(0, len(chosen), cfg.batch_size):
+        batch = chosen[start : start + cfg.batch_size]
+        nats = answer_loss(student, [sample.row for sample in batch], context.features_of(batch), LOGIT_CHUNK)
         nats.backward()
         own_nats += float(nats.detach())
-    encoded = [row for row, _ in rows]
-    weights, answers = sum(float(row.weights.sum()) for row in encoded), sum(len(row.answer_ids) for row in encoded)
-    own = weights, answers, sum(map(len, encoded)), len(rows)
+    rows = [sample.row for sample in chosen]
+    own = sum(row.weight for row in rows), sum(len(row.answer_ids) for row in rows), sum(map(len, rows)), len(rows)
     add_gradients(parameters, context.accelerator)
     total, weight, answer_tokens, tokens, samples = context.total([own_nats, *map(float, own)])
     for parameter in parameters:
@@ -167,18 +168,17 @@ def _take_steps(context: TrainingContext, optimizer: Any, progress: Progress, fo
     cfg, accelerator, lengths = context.cfg, context.accelerator, context.train.lengths
     first, start_s, mine = progress.step, time.monotonic(), (accelerator.process_index, accelerator.num_processes)
     num_steps, per_epoch = count_steps(cfg, len(lengths))
-    shares = (share_of(step, lengths, *mine) for step in steps_from(cfg, len(lengths), context.seed, first))
     step_start_s = start_s
     with progress_bar(STAGE, total=num_steps, done=first) as advance:
-        for step, rows in enumerate(context.train.rows(shares, num_workers(cfg.data_workers)), first):
-            waited_s, rate = time.monotonic() - step_start_s, learning_rate_at(cfg, step, num_steps)
+        for step, numbers in enumerate(steps_from(cfg, len(lengths), context.seed, first), first):
+            chosen = [context.train.used[number] for number in share_of(numbers, lengths, *mine)]
+            rate = learning_rate_at(cfg, step, num_steps)
             with seeded(context.student, context.seed, f"step_{step}_{accelerator.process_index}"):
-                facts = train_step(context, optimizer, rows, rate)
+                facts = train_step(context, optimizer, chosen, rate)
             done, now_s = step + 1, time.monotonic()
             seconds = max(now_s - step_start_s, 1e-9)
             speed = {
                 "seconds": round(seconds, 4),
-                "waited_share": round(waited_s / seconds, 4),
                 "tokens_per_s": round(facts["tokens"] / seconds, 1),
                 "memory_gb": round(used_gb(context.student.device), 3),
                 "left_s": round((now_s - start_s) / (done - first) * (num_steps - done), 1),
@@ -209,15 +209,15 @@ def validate(context: TrainingContext, progress: Progress, note: Note) -> Progre
         return progress
     # By length, so that little is padded, and dealt out so that all processes have about the same to do.
     order = share_of(range(len(split.used)), split.lengths, accelerator.process_index, accelerator.num_processes)
-    batches = [order[start : start + cfg.batch_size] for start in range(0, len(order), cfg.batch_size)]
     nats, weight = 0.0, 0.0
     context.student.model.eval()
     with torch.no_grad(), progress_bar(f"{STAGE}: validation", total=len(order)) as advance:
-        for rows in split.rows(batches, num_workers(cfg.data_workers, len(order))):
-            encoded = [row for row, _ in rows]
-            nats += float(answer_loss(context.student, encoded, context.features_of(rows), LOGIT_CHUNK))
-            weight += sum(float(row.weights.sum()) for row in encoded)
-            advance(len(rows))
+        for start in range(0, len(order), cfg.batch_size):
+            batch = [split.used[number] for number in order[start : start + cfg.batch_size]]
+            rows = [sample.row for sample in batch]
+            nats += float(answer_loss(context.student, rows, context.features_of(batch), LOGIT_CHUNK))
+            weight += sum(row.weight for row in rows)
+            advance(len(batch))
     nats, weight = context.total([nats, weight])
     note({"step": progress.step, "validation": {"samples": len(split.used), "loss": nats / weight}})
     log.info("%s: after step %d: validation loss %.4f", STAGE, progress.step, nats / weight)

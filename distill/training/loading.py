@@ -1,9 +1,10 @@
-"""Data of a training: the samples that are used, their tokens by worker processes, features of their pictures."""
+"""Data of a training: the samples that are used, as tokens, and the features of their pictures."""
 
 from __future__ import annotations
 
+import logging
 import os
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -13,7 +14,7 @@ import numpy as np
 
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import CosflyError
-from cosfly.runtime.limits import num_cpus
+from cosfly.runtime.limits import memory_bytes, num_cpus
 from cosfly.runtime.worker import end_with_parent
 from distill.schema import Sample
 from distill.student.chat import EncodedSample, FieldWeights, Processor, special_token_in
@@ -21,19 +22,15 @@ from distill.student.features import FramePicture, PictureReader, Tensors, encod
 from distill.student.model import Student
 from distill.training.settings import STAGE, TrainConfig
 
+log = logging.getLogger(__name__)
+
 MOST_WORKERS = 16
 SAMPLES_PER_WORKER = 64  # for fewer, another worker process is not worth its start
+FEATURES_SHARE = 0.5  # of the memory of a machine: for the features of pictures in all of its processes
 TOO_LONG, SPECIAL_TOKEN, UNREADABLE = "too_long", "special_token", "unreadable_picture"
 
-Rows = Sequence[tuple[EncodedSample, Sample]]
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
-
-
-def num_workers(wanted: int, num_items: int = MOST_WORKERS * SAMPLES_PER_WORKER) -> int:
-    """Return the number of worker processes for some items; negative: one per CPU, at most MOST_WORKERS."""
-    most = wanted if wanted >= 0 else min(MOST_WORKERS, num_cpus())
-    return min(most, num_items // SAMPLES_PER_WORKER)
 
 
 @dataclass(frozen=True)
@@ -63,11 +60,17 @@ def _unchanged(value: Any) -> Any:
     return value
 
 
-def in_order(function: Callable[[ItemT], ResultT], items: Iterable[ItemT], workers: int) -> Iterator[ResultT]:
-    """Yield function(item) for each item, in order, computed ahead by `workers` processes; 0: in this process."""
+def in_order(function: Callable[[ItemT], ResultT], items: Sequence[ItemT], wanted: int) -> Iterator[ResultT]:
+    """Yield function(item) for each item, in order, computed ahead by worker processes.
+
+    Args:
+        wanted: most worker processes; 0: none, negative: one per CPU, at most MOST_WORKERS.
+    """
     import torch
 
     os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")  # threads do not survive the fork
+    most = wanted if wanted >= 0 else min(MOST_WORKERS, num_cpus())
+    workers = min(most, len(items) // SAMPLES_PER_WORKER)
     loader: Any = torch.utils.data.DataLoader(
         _Work(function),  # type: ignore[arg-type]  # all that the loader asks of a data set
         batch_size=None,
@@ -83,73 +86,65 @@ def in_order(function: Callable[[ItemT], ResultT], items: Iterable[ItemT], worke
         yield result
 
 
-class SampleTokens(NamedTuple):
-    """The size of a sample, and why it is skipped, if it is. place: its index in the split."""
+class TrainingSample(NamedTuple):
+    """A sample as tokens, with its pictures. place: its index in the split."""
 
     place: int
-    num_tokens: int
-    num_answer_tokens: int
+    row: EncodedSample
     pictures: tuple[FramePicture, ...]
-    skip_reason: str = ""
-    skip_detail: str = ""
 
 
 @dataclass
 class TrainingSplit:
-    """The samples of a split as tokens: those that are used, by increasing place, and those that are skipped."""
+    """The samples of a split as tokens.
+
+    used: by increasing place. skipped: reason -> what was found in each sample that cannot be used.
+    """
 
     samples: Sequence[Sample]
     processor: Processor
     max_pixels: int
     weights: FieldWeights
-    used: list[SampleTokens] = field(default_factory=list)
-    skipped: list[SampleTokens] = field(default_factory=list)
+    used: list[TrainingSample] = field(default_factory=list)
+    skipped: defaultdict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
 
-    def count(self, places: Sequence[int], max_tokens: int, workers: int) -> None:
-        """Count the tokens of samples, and skip those that cannot be used."""
+    def encode(self, places: Sequence[int], max_tokens: int, workers: int) -> None:
+        """Encode samples, and skip those that cannot be used."""
         known: dict[FramePicture, FramePicture] = {}  # equal pictures become one object
-        counted = in_order(partial(self._count, max_tokens=max_tokens), places, num_workers(workers, len(places)))
-        with progress_bar(f"{STAGE}: counting tokens", total=len(places)) as advance:
-            for sample in counted:
-                pictures = tuple(known.setdefault(picture, picture) for picture in sample.pictures)
-                (self.skipped if sample.skip_reason else self.used).append(sample._replace(pictures=pictures))
+        encoded = in_order(partial(self._encode, max_tokens=max_tokens), places, workers)
+        with progress_bar(f"{STAGE}: encoding texts", total=len(places)) as advance:
+            for found in encoded:
+                if isinstance(found, TrainingSample):
+                    pictures = tuple(known.setdefault(picture, picture) for picture in found.pictures)
+                    self.used.append(found._replace(pictures=pictures))
+                else:
+                    self.skipped[found[0]].append(found[1])
                 advance(1)
 
-    def _count(self, place: int, max_tokens: int) -> SampleTokens:
+    def _encode(self, place: int, max_tokens: int) -> TrainingSample | tuple[str, str]:
+        """Return a sample as tokens, or why it is skipped."""
         sample = self.samples[place]
-        pictures = tuple(pictures_of(sample))
         if token := special_token_in(self.processor, sample):
-            return SampleTokens(place, 0, 0, pictures, SPECIAL_TOKEN, f"{sample.key}: a text contains {token}")
-        row = self.processor.encode(sample, self.max_pixels)
-        found = SampleTokens(place, len(row), len(row.answer_ids), pictures)
+            return SPECIAL_TOKEN, f"{sample.key}: a text contains {token}"
+        row = self.processor.encode(sample, self.max_pixels, self.weights)
         if len(row) > max_tokens:
-            return found._replace(skip_reason=TOO_LONG, skip_detail=f"{sample.key}: {len(row)} tokens")
-        return found
+            return TOO_LONG, f"{sample.key}: {len(row)} tokens"
+        return TrainingSample(place, row, tuple(pictures_of(sample)))
 
     def skip_unreadable(self, unreadable: Mapping[FramePicture, str]) -> None:
         """Skip the samples with a picture that cannot be read."""
         used, self.used = self.used, []
         for sample in used:
-            words = next((unreadable[picture] for picture in sample.pictures if picture in unreadable), "")
-            sample = sample._replace(skip_reason=UNREADABLE if words else "", skip_detail=words)
-            (self.skipped if words else self.used).append(sample)
+            words = next((unreadable[picture] for picture in sample.pictures if picture in unreadable), None)
+            if words is None:
+                self.used.append(sample)
+            else:
+                self.skipped[UNREADABLE].append(words)
 
     @property
     def lengths(self) -> np.ndarray:
         """Tokens of each used sample, (n,) int64."""
-        return np.array([sample.num_tokens for sample in self.used], dtype=np.int64)
-
-    @property
-    def skip_reasons(self) -> Counter[str]:
-        return Counter(sample.skip_reason for sample in self.skipped)
-
-    def encode(self, places: Sequence[int]) -> Rows:
-        samples = [self.samples[place] for place in places]
-        return [(self.processor.encode(sample, self.max_pixels, self.weights), sample) for sample in samples]
-
-    def rows(self, shares: Iterable[Sequence[int]], workers: int) -> Iterator[Rows]:
-        """Yield the rows of each share of the used samples."""
-        return in_order(self.encode, ([self.used[number].place for number in share] for share in shares), workers)
+        return np.array([len(sample.row) for sample in self.used], dtype=np.int64)
 
 
 @dataclass
@@ -162,23 +157,35 @@ class TrainingContext:
     accelerator: Any
     train: TrainingSplit
     val: TrainingSplit
+    reader: PictureReader
     features: dict[FramePicture, Tensors] = field(default_factory=dict)
 
-    def read_pictures(self, reader: PictureReader) -> None:
-        """Read and encode all pictures once, and skip the samples with a picture that cannot be read."""
+    def read_pictures(self) -> None:
+        """Read and encode all pictures once, and skip the samples with a picture that cannot be read.
+
+        Features that do not fit into their share of the memory are not kept: these pictures are encoded at each use.
+        """
+        most_bytes = FEATURES_SHARE * memory_bytes() / int(os.environ.get("LOCAL_WORLD_SIZE", 1))
         splits = self.train, self.val
         pictures = list(dict.fromkeys(p for split in splits for sample in split.used for p in sample.pictures))
         with progress_bar(f"{STAGE}: pictures", total=len(pictures)) as advance:
-            read = in_order(reader.try_to_read, pictures, num_workers(self.cfg.data_workers, len(pictures)))
+            read = in_order(self.reader.try_to_read, pictures, self.cfg.data_workers)
             counted = (advance(1) or tensors for tensors in read)
-            is_frozen = not self.cfg.train_vision
-            self.features, unreadable = read_features(self.student, pictures, counted, is_frozen=is_frozen)
+            own: Any = {"is_frozen": not self.cfg.train_vision, "most_bytes": most_bytes}
+            self.features, unreadable = read_features(self.student, pictures, counted, **own)
+        if num_others := len(pictures) - len(self.features) - len(unreadable):
+            words = "%s: the features of %d pictures do not fit into the memory: they are encoded at each use"
+            log.warning(words, STAGE, num_others)
         for split in splits:
             split.skip_unreadable(unreadable)
 
-    def features_of(self, rows: Rows) -> list[Tensors]:
-        """Return the features of the pictures of rows, row after row."""
-        found = [self.features[picture] for _, sample in rows for picture in pictures_of(sample)]
+    def features_of(self, samples: Iterable[TrainingSample]) -> list[Tensors]:
+        """Return the features of the pictures of samples, sample after sample."""
+        pictures = [picture for sample in samples for picture in sample.pictures]
+        others = [picture for picture in dict.fromkeys(pictures) if picture not in self.features]
+        read = map(self.reader.read, others)
+        again, _ = read_features(self.student, others, read, is_frozen=not self.cfg.train_vision)
+        found = [again[picture] if picture in again else self.features[picture] for picture in pictures]
         return encode(self.student, found) if self.cfg.train_vision else found
 
     def total(self, values: Sequence[float]) -> list[float]:

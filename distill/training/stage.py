@@ -9,6 +9,7 @@ import contextlib
 import logging
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import timedelta
 from importlib import metadata
@@ -93,8 +94,8 @@ def target_modules(student: Student) -> str:
 
     decoder, head = student.core.get_decoder(), student.core.get_output_embeddings()
     prefix = next(name for name, module in student.core.named_modules() if module is decoder)
-    linear = (torch.nn.Linear,)
-    names = {n.rpartition(".")[2] for n, m in decoder.named_modules() if isinstance(m, linear) and m is not head}
+    linear = [name for name, m in decoder.named_modules() if isinstance(m, torch.nn.Linear) and m is not head]
+    names = {name.rpartition(".")[2] for name in linear}
     return rf"{re.escape(prefix)}\.(.*\.)?({'|'.join(map(re.escape, sorted(names)))})"
 
 
@@ -102,11 +103,8 @@ def vision_modules(student: Student) -> list[Any]:
     """Return the parts of the model that are not its language model and not its output head."""
     if not student.has_pictures:
         return []
-    decoder, head = (
-        {id(module) for module in student.core.get_decoder().modules()},
-        student.core.get_output_embeddings(),
-    )
-    return [child for child in student.core.base_model.children() if id(child) not in decoder and child is not head]
+    language = {*student.core.get_decoder().modules(), student.core.get_output_embeddings()}
+    return [child for child in student.core.base_model.children() if child not in language]
 
 
 def prepared_student(cfg: TrainConfig, base: Path, seed: int, device: str) -> Student:
@@ -220,48 +218,47 @@ def run(
     with torch_errors(cfg), processes(cfg, out) as accelerator:
         trees = resolve_trees(dataset, data)
         random_student = {TINY: TINY_STUDENT, RANDOM: cfg.random_student}.get(str(student))
-        base = out / STUDENT if random_student else student_path(str(student), allow_code=cfg.allow_code)
-        if random_student is not None:
-            cfg = cfg.model_copy(update={"random_student": random_student})
-        inputs = {
-            "dataset": dataset,
-            **tree_inputs(trees.values()),
-            **({} if random_student else weight_files(base)),
-        }
-        opened: list[StageFolder] = []
-
-        def begin() -> bool:
+        inputs = {"dataset": dataset, **tree_inputs(trees.values())}
+        if random_student is None:
+            base = student_path(str(student), allow_code=cfg.allow_code)
+            inputs |= weight_files(base)
+        else:
+            base, cfg = out / STUDENT, cfg.model_copy(update={"random_student": random_student})
+        folder: StageFolder | None = None
+        if accelerator.is_main_process:  # its error ends all
             given: Any = {"config": cfg, "inputs": inputs, "seed": seed, "resume": resume}
-            opened.append(StageFolder.open(out, STAGE, **given, begun=(LOG, STUDENT)))
-            if random_student and not opened[0].is_complete and not base.exists():
-                samples = open_split(dataset, "train")
-                chosen = (samples[i] for i in range(0, len(samples), max(1, len(samples) // TOKENIZER_SAMPLES)))
-                texts = (text for s in chosen for text in (s.prompt.system, s.prompt.user, s.answer))
-                make_random_student(base, random_student, seed, texts)
-            return opened[0].is_complete
-
-        # Only the first process may open the folder, and its error ends all.
-        if broadcast_object_list([begin() if accelerator.is_main_process else None])[0]:
+            folder = StageFolder.open(out, STAGE, **given, begun=(LOG, STUDENT))
+            if random_student and not folder.is_complete and not base.exists():
+                make_random_student(base, random_student, seed, _texts(open_split(dataset, "train")))
+        if broadcast_object_list([folder is not None and folder.is_complete])[0]:
             return product
         accelerator.init_trackers(STAGE)
         context = _context(cfg, dataset, trees, base, seed, accelerator)
         progress = fit(context, out)
-        if accelerator.is_main_process:
-            used, skipped = context.train.used, context.train.skip_reasons
+        if folder is not None:
+            used = context.train.used
+            skipped = Counter({reason: len(found) for reason, found in context.train.skipped.items()})
             tally = Tally(input=len(used) + skipped.total(), kept=len(used), dropped=skipped)
             _write_product(context, product, base, base_name)
-            opened[0].finish(
+            folder.finish(
                 [out / LOG, *sorted(product.iterdir())],
                 tally,
                 steps=progress.step,
                 best_step=progress.best_step,
-                tokens=sum(sample.num_tokens for sample in used),
+                tokens=int(context.train.lengths.sum()),
                 parameters=sum(p.numel() for p in context.student.model.parameters()),
                 trainable_parameters=sum(p.numel() for p in learning_weights(context.student).values()),
                 device=context.student.device,
                 versions={name: metadata.version(name) for name in ("torch", "transformers", "peft")},
             )
     return product
+
+
+def _texts(samples: Sequence[Sample]) -> Iterator[str]:
+    """Yield the texts that the tokenizer of a random student is trained on."""
+    for number in range(0, len(samples), max(1, len(samples) // TOKENIZER_SAMPLES)):
+        sample = samples[number]
+        yield from (sample.prompt.system, sample.prompt.user, sample.answer)
 
 
 def _context(
@@ -281,19 +278,20 @@ def _context(
     weights = {"flight_decision": cfg.decision_weight, "reasoning_trace": cfg.reason_weight}
     train, val = (TrainingSplit(part, student, cfg.max_pixels, weights) for part in (samples, validation))
     order = rng_for(seed, STAGE, "validation").permutation(len(validation))
-    train.count(range(len(samples)), cfg.max_tokens, cfg.data_workers)
-    val.count(sorted(order[: cfg.validation_samples].tolist()), cfg.max_tokens, cfg.data_workers)
-    context = TrainingContext(student, cfg, seed, accelerator, train, val)
-    context.read_pictures(PictureReader(student, trees, student.dtype, cfg.max_pixels))
+    train.encode(range(len(samples)), cfg.max_tokens, cfg.data_workers)
+    val.encode(sorted(order[: cfg.validation_samples].tolist()), cfg.max_tokens, cfg.data_workers)
+    reader = PictureReader(student, trees, student.dtype, cfg.max_pixels)
+    context = TrainingContext(student, cfg, seed, accelerator, train, val, reader)
+    context.read_pictures()
     for name, split in (("train", train), ("val", val)):
-        answers, tokens = (sum(counts) for counts in ([s.num_answer_tokens for s in split.used], split.lengths))
         words = "%s: %s has %d samples with %d tokens, %d of them in answers"
-        log.info(words, STAGE, name, len(split.used), tokens, answers)
-        for reason, count in sorted(split.skip_reasons.items()):
-            first = next(sample.skip_detail for sample in split.skipped if sample.skip_reason == reason)
-            log.warning("%s: %d samples of %s are skipped as %s; the first: %s", STAGE, count, name, reason, first)
+        num_answer = sum(len(sample.row.answer_ids) for sample in split.used)
+        log.info(words, STAGE, name, len(split.used), split.lengths.sum(), num_answer)
+        for reason, found in sorted(split.skipped.items()):
+            words = "%s: %d samples of %s are skipped as %s; the first: %s"
+            log.warning(words, STAGE, len(found), name, reason, found[0])
     if not train.used:
-        words, got = "no sample can be used for training", ", ".join(train.skip_reasons)
+        words, got = "no sample can be used for training", ", ".join(train.skipped)
         raise InputError(words, where=dataset, got=got, fix="read the warnings above, and change the settings")
     return context
 

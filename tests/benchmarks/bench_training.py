@@ -11,8 +11,7 @@ samples.
                                                                  plain transformers and peft
 
 Steps are the project's own: features of pictures kept, logits for a few answer tokens at a time, rows by
-length. Pictures are noise in memory: what reading takes tells `cosfly distill train` on a tree (`waited_share` in its
-log). The first steps compile kernels and are not counted.
+length. Pictures are noise in memory: reading them is not measured. The first steps compile kernels and are not counted.
 """
 
 import argparse
