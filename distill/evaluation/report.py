@@ -12,7 +12,7 @@ from cosfly.runtime.json_io import FileFormat, Record
 from cosfly.viz.page import page
 from cosfly.viz.tables import TextTable
 from distill.evaluation.bertscore import Metric
-from distill.evaluation.figures import BERTSCORE, BINS, FIGURES, TEACHER, UNPARSED_NAME, FigureSet, Measurement, Pairing
+from distill.evaluation.figures import BERTSCORE, BINS, FIGURES, TEACHER, UNPARSED_NAME, FigureSet, Measurement
 
 REPORT, REPORT_FORMAT = "report.json", FileFormat("cosfly.distill_report", "4.0", "report")
 LANGUAGES: dict[Language, str] = {"en": "English", "zh": "Chinese"}
@@ -91,48 +91,33 @@ def _shown(name: str, figure: Figure | None, *, signed: bool = False) -> str:
     return "-" if figure is None else figure.shown(f"{'+' if signed else ''}{digits}")
 
 
-def _columns(report: Evaluation, part: Measurement) -> dict[str, FigureSet]:
-    """Return the columns of every table: students, teacher, baselines, and the paper's students."""
-    own = {
-        name if name in report.students or name == TEACHER else f"baseline: {name}": found
-        for name, found in part.who.items()
-    }
-    return own | _paper()
+def tables_of(report: Evaluation, language: Language) -> list[TextTable]:
+    """Return the tables of one language: everybody's figures, accuracy by decision, and the differences of students.
 
-
-def main_table(report: Evaluation, language: Language) -> TextTable:
-    """Return the figures of everybody on the samples of one language, with intervals."""
+    Columns are students, teacher, baselines, and the paper's students.
+    """
     part, metric = report.languages[language], report.metrics[language]
-    columns = _columns(report, part)
-    rows = []
-    for name, words in FIGURES.items():
-        if any(own.figures[name].value is not None for own in part.who.values()):
-            words += f" ({metric.model} layer {metric.layer})" if metric and name in BERTSCORE else ""
-            rows.append([words, *(_shown(name, own.figures[name]) for own in columns.values())])
-    heading = f"{LANGUAGES[language]}: {part.samples} samples of {part.walks} pedestrian trajectories"
-    return TextTable(heading, ["", *columns], rows)
-
-
-def decision_table(report: Evaluation, part: Measurement) -> TextTable:
-    """Return everybody's share of right answers by the teacher's decision, the most frequent decision first."""
-    columns = _columns(report, part)
+    labels = {name: name if name in report.students or name == TEACHER else f"baseline: {name}" for name in part.who}
+    columns = {label: part.who[name] for name, label in labels.items()} | _paper()
+    encoder = f" ({metric.model} layer {metric.layer})" if metric else ""
+    main = [
+        [words + encoder * (name in BERTSCORE), *(_shown(name, own.figures[name]) for own in columns.values())]
+        for name, words in FIGURES.items()
+        if any(own.figures[name].value is not None for own in part.who.values())
+    ]
     counts = {token: figure.count for token, figure in part.who[TEACHER].by_decision.items()}
-    ranked = sorted(counts, key=lambda token: -counts[token])
-    rows = [
+    decisions = [
         [f"{token} ({counts[token]})", *(_shown(token, own.by_decision.get(token)) for own in columns.values())]
-        for token in ranked
+        for token in sorted(counts, key=lambda token: -counts[token])
     ]
-    return TextTable("Accuracy by the teacher's decision", ["", *columns], rows)
-
-
-def pairing_table(pairing: Pairing) -> TextTable:
-    """Return the differences of two students."""
-    rows = [
-        [FIGURES[name], _shown(name, found, signed=True)]
-        for name, found in pairing.differences.items()
-        if found.value is not None
-    ]
-    return TextTable(f"{pairing.first} minus {pairing.second}", ["", "difference"], rows)
+    heading = f"{LANGUAGES[language]}: {part.samples} samples of {part.walks} pedestrian trajectories"
+    tables = [TextTable(heading, ["", *columns], main)]
+    tables.append(TextTable("Accuracy by the teacher's decision", ["", *columns], decisions))
+    for pairing in part.pairings:
+        found = {name: figure for name, figure in pairing.differences.items() if figure.value is not None}
+        rows = [[FIGURES[name], _shown(name, figure, signed=True)] for name, figure in found.items()]
+        tables.append(TextTable(f"{pairing.first} minus {pairing.second}", ["", "difference"], rows))
+    return tables
 
 
 def notes_of(report: Evaluation) -> list[str]:
@@ -157,9 +142,8 @@ def notes_of(report: Evaluation) -> list[str]:
         if student.not_asked:
             facts.append(f"{student.not_asked} samples of the split have no prediction")
         notes.append("; ".join([f"{name} is {student.model}", *facts]) + ".")
-    if all(
-        own.figures["values_matched"].value is None for part in report.languages.values() for own in part.who.values()
-    ):
+    everyone = [own for part in report.languages.values() for own in part.who.values()]
+    if all(own.figures["values_matched"].value is None for own in everyone):
         notes.append("Values were not checked; pass the captions of cosfly caption --teacher student:PATH as --judged.")
     return notes
 
@@ -167,12 +151,11 @@ def notes_of(report: Evaluation) -> list[str]:
 def markdown_of(report: Evaluation) -> str:
     """Return the report as a page of Markdown."""
     lines = [f"# {', '.join(map(for_markdown, report.students))} on {report.split}", ""]
-    for language, part in report.languages.items():
-        tables = [decision_table(report, part), *map(pairing_table, part.pairings)]
-        for level, table in [("##", main_table(report, language)), *(("###", table) for table in tables)]:
-            escaped = [[for_markdown(cell) for cell in row] for row in [table.columns, *table.rows]]
-            text = TextTable(table.title, escaped[0], escaped[1:]).markdown()
-            lines += [f"{level} {for_markdown(table.title)}", "", text]
+    for language in report.languages:
+        for number, table in enumerate(tables_of(report, language)):
+            columns, *rows = [[for_markdown(cell) for cell in row] for row in [table.columns, *table.rows]]
+            text = TextTable(table.title, columns, rows).markdown()
+            lines += [f"{'###' if number else '##'} {for_markdown(table.title)}", "", text]
     lines += ["## How it was measured", "", *(f"- {for_markdown(note)}" for note in notes_of(report))]
     return "\n".join(lines) + "\n"
 
@@ -182,23 +165,19 @@ def markdown_of(report: Evaluation) -> str:
 
 def page_of(report: Evaluation) -> str:
     """Return the report as a self-contained page."""
-    parts = [
-        {
-            "main": main_table(report, language),
-            "tables": [decision_table(report, part), *map(pairing_table, part.pairings)],
-            "plots": [*_confusions(report, part), *_histograms(part)],
-        }
-        for language, part in report.languages.items()
-    ]
-    look = {"shown": _cell, "numeric_columns": lambda table: table["numeric"], "greatest": lambda table: table["most"]}
+    parts = []
+    for language, part in report.languages.items():
+        main, *tables = tables_of(report, language)
+        parts.append({"main": main, "tables": tables, "plots": [*_confusions(report, part), *_histograms(part)]})
+    look = {
+        "shown": lambda cell: f"{cell:.0%}" if isinstance(cell, float) else str(cell),
+        "numeric_columns": lambda table: table["numeric"],
+        "greatest": lambda table: table["most"],
+    }
     return page(
         "distill/evaluation/evaluation.html", title=", ".join(report.students), report=report, parts=parts,
         notes=notes_of(report), fields=FIELDS, look=look,
     )  # fmt: skip
-
-
-def _cell(cell: Any) -> str:
-    return f"{cell:.0%}" if isinstance(cell, float) else str(cell)
 
 
 def _confusions(report: Evaluation, part: Measurement) -> list[dict[str, Any]]:

@@ -80,21 +80,14 @@ def run(
     paths = [path / PREDICTIONS if path.is_dir() else path for path in predictions]
     files = {path.absolute().parent.name: path for path in paths}
     if len(files) < len(paths) or files.keys() & {TEACHER, *BASELINES}:
-        what, fix = (
-            "two columns of the table have the same name",
-            "rename the folder of a student, which names its column",
-        )
-        raise InputError(what, got=", ".join(files), fix=fix)
+        fix = "rename the folder of a student, which names its column"
+        raise InputError("two columns of the table have the same name", got=", ".join(files), fix=fix)
     encoders = dict(encoders or {})
-    # Without dots, which would begin the name of another run.
-    named = {f"{n}_{name.replace('.', '_')}": path for n, (name, path) in enumerate(files.items(), 1)}
-    inputs = {"dataset": dataset, **{f"predictions/{name}": path for name, path in named.items()}}
-    inputs |= {f"judged/{n}": path for n, path in enumerate(judged, 1)}
-    inputs |= {
-        f"bertscore/{language}/{path.name}": path
-        for language, folder in encoders.items()
-        for path in encoder_files(folder)
-    }
+    inputs = {"dataset": dataset} | {f"judged/{n}": path for n, path in enumerate(judged, 1)}
+    for n, (name, path) in enumerate(files.items(), 1):  # without dots, which would begin the name of another run
+        inputs[f"predictions/{n}_{name.replace('.', '_')}"] = path
+    for language, folder in encoders.items():
+        inputs |= {f"bertscore/{language}/{path.name}": path for path in encoder_files(folder)}
     stage = StageFolder.open(out, STAGE, config=Config(), inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return out / REPORT
@@ -155,11 +148,6 @@ def read_judged(paths: Sequence[Path]) -> JudgedValues:
     return found
 
 
-def _values_of(sample: Sample, prediction: Prediction, judged: JudgedValues) -> ValueCounts | None:
-    rest = (sample.window_id, sample.language, text_of(prediction.coc))
-    return judged.get((sample.run, *rest)) or judged.get((None, *rest))
-
-
 def evaluate(
     samples: Sequence[Sample],
     students: dict[str, StudentRecord],
@@ -179,7 +167,8 @@ def evaluate(
         everyone: dict[str, Answers] = {}
         for name, of_key in predictions.items():
             asked = [of_key[sample.key] for sample in own]
-            values = [_values_of(sample, answer, judged) for sample, answer in zip(own, asked, strict=True)]
+            keys = [(s.window_id, s.language, text_of(p.coc)) for s, p in zip(own, asked, strict=True)]
+            values = [judged.get((s.run, *key)) or judged.get((None, *key)) for s, key in zip(own, keys, strict=True)]
             everyone[name] = Answers.of_student(asked, values)
         everyone |= floors_of(open_split(dataset, "train"), own, language, seed)
         metrics[language] = None

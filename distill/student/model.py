@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from cosfly.runtime.errors import EnvironmentMissing, InputError
+from cosfly.runtime.errors import CosflyError, EnvironmentMissing, InputError
 from cosfly.runtime.io import read_text
 from cosfly.runtime.json_io import read_json, read_object
 from distill.student.chat import Processor
@@ -142,23 +142,16 @@ def compute_dtype(wanted: Dtype, device: str) -> Any:
 @contextlib.contextmanager
 def loading_errors(what: str, where: Path) -> Iterator[None]:
     """Convert what transformers, peft, gguf and safetensors raise about a file into one line."""
-    from safetensors import SafetensorError
-
     try:
         yield
-    except (
-        ImportError,
-        LookupError,
-        OSError,
-        RuntimeError,
-        TypeError,
-        UserWarning,
-        ValueError,
-        SafetensorError,
-    ) as error:
+    except CosflyError:
+        raise
+    except Exception as error:  # tokenizers raises this class itself
         got = " ".join(str(error).split())[:300] or type(error).__name__
-        fix = "update transformers, use another student, or set allow_code=true if you trust the code that it needs"
-        if where.suffix == GGUF:
+        fix = "update transformers, or use another student"
+        if "trust_remote_code" in str(error):
+            got, fix = "it needs code of its own", "set allow_code=true if you trust this code, or use another student"
+        elif where.suffix == GGUF:
             fix = "use a file of another quantization, such as Q8_0 or F16"
         raise InputError(f"the {what} cannot be loaded", where=where, got=got, fix=fix) from error
 
@@ -266,7 +259,10 @@ def load_student(
         family.choose_kernels(computed, device_name)
     dtypes: Any = {"dtype": torch.float32 if is_trained else computed, "use_safetensors": True}
     with loading_errors("student", adapter or path):
-        model: Any = auto_class.from_pretrained(**arguments, **dtypes)
+        model, info = auto_class.from_pretrained(**arguments, **dtypes, output_loading_info=True)
+        if missing := sorted(info["missing_keys"]):  # the library would draw them at random
+            got, fix = f"no {missing[0]} and {len(missing) - 1} others", "download the whole model"
+            raise InputError("the student has no weights for some of its layers", where=path, got=got, fix=fix)
         if path.suffix == GGUF:
             # The weights are plain numbers now, which can be saved.
             model.config.__dict__.pop("quantization_config", None)
