@@ -100,3 +100,4 @@ def test_nothing_answered_is_asked_twice(place, tmp_path, monkeypatch):
         before = path.read_bytes()
         assert infer_with(cfg, place, server.url, out).read_bytes() == before
         assert len(server.bodies) == num_asked + num_samples - num_kept
+    assert infer_with(cfg, place, server.url, out).read_bytes() == before  # a complete folder needs no server

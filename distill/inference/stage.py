@@ -38,7 +38,7 @@ from cosfly.runtime.model_json import CONTEXT_FULL
 from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, read_manifest, read_stage_record, write_failures
 from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
 from distill.student.chat import EncodedSample, load_pictures
-from distill.student.features import FramePicture, PictureReader, Tensors, pictures_of, read_features
+from distill.student.features import PictureReader, Tensors, pictures_of, read_features
 from distill.student.generate import Completion, generate
 from distill.student.model import Device, load_student, require, student_path, weight_files
 from distill.student.saving import check_adapter
@@ -205,56 +205,52 @@ class LocalAnswers:
         """Yield the outcome of each sample, in their order; `advance` is called after each batch."""
         rest = iter(samples if self.student.has_pictures else (sample.without_pictures() for sample in samples))
         while batch := list(islice(rest, self.batch_size)):
-            answers = {sample.key: self.book.get(flight_of(sample.sample_id), self._key(sample)) for sample in batch}
-            found = {s.key: SampleOutcome(s, known) for s in batch if (known := answers[s.key]) is not None}
-            if len(found) < len(batch):
-                found = await self._answer(batch) | found
+            recorded = [self.book.get(flight_of(sample.sample_id), self._key(sample)) for sample in batch]
+            outcomes = self._answer(batch) if None in recorded else []
+            new = [one.found for one, old in zip(outcomes, recorded, strict=False) if old is None]
+            answers = [answer for answer in new if isinstance(answer, Answer)]
+            await asyncio.gather(*(self.book.put(flight_of(answer.sample_id), answer) for answer in answers))
             advance(len(batch))
-            for sample in batch:
-                yield found[sample.key]
+            for i, (sample, answer) in enumerate(zip(batch, recorded, strict=True)):
+                yield outcomes[i] if answer is None else SampleOutcome(sample, answer)
 
     def _key(self, sample: Sample) -> str:
         """Return a digest of what the answer depends on, besides the inputs in the folder's record."""
         asked = sample.model_dump(mode="json", include={"run", "window", "views", "picture_px", "prompt", "language"})
         return sha256_bytes(dump_json([self.model, sample.sample_id, asked, self.max_tokens]).encode())
 
-    async def _answer(self, batch: list[Sample]) -> dict[str, SampleOutcome]:
-        """Answer a batch, and record the answers that are new; they are on the disk when this returns."""
+    def _answer(self, batch: list[Sample]) -> list[SampleOutcome]:
+        """Answer a batch."""
         pictures = list(dict.fromkeys(picture for sample in batch for picture in pictures_of(sample)))
-        features, errors = read_features(self.student, pictures, map(self._reader.try_to_read, pictures))
-        found: dict[str, SampleOutcome] = {}
-        rows: list[tuple[EncodedSample, Sample]] = []
-        for sample in batch:
+        features = read_features(self.student, pictures, map(self._reader.try_to_read, pictures))
+        rows: dict[int, tuple[EncodedSample, list[Any]]] = {}
+        outcomes: dict[int, SampleOutcome] = {}
+        for i, sample in enumerate(batch):
+            seen = [features[picture] for picture in pictures_of(sample)]
             try:
-                bad = next((picture for picture in pictures_of(sample) if picture in errors), None)
-                if bad is None:
-                    rows.append((self.student.encode(sample, self.max_pixels), sample))
-                else:
-                    found[sample.key] = SampleOutcome.failed(sample, InputError.code, errors[bad])
+                if errors := [words for words in seen if isinstance(words, str)]:
+                    raise InputError(errors[0])
+                rows[i] = self.student.encode(sample, self.max_pixels), seen
             except InputError as error:
-                found[sample.key] = SampleOutcome.failed(sample, error.code, error)
+                outcomes[i] = SampleOutcome.failed(sample, error.code, error)
         start_s = time.monotonic()
-        completions = self._decode(rows, features) if rows else []
+        completions = self._decode([*rows.values()]) if rows else []
         latency_s = round(time.monotonic() - start_s, 3)
-        for (row, sample), completion in zip(rows, completions, strict=True):
+        for (i, (row, _)), completion in zip(rows.items(), completions, strict=True):
             answer = Answer(
-                key=self._key(sample), sample_id=sample.sample_id, purpose=sample.language, model=self.model,
+                key=self._key(batch[i]), sample_id=batch[i].sample_id, purpose=batch[i].language, model=self.model,
                 text=completion.text, structured="plain", latency_s=latency_s, time=round(time.time(), 3),
                 usage={"prompt_tokens": len(row.prompt_ids), "completion_tokens": completion.num_tokens},
                 finish_reason="stop" if completion.is_finished else "length",
             )  # fmt: skip
-            found[sample.key] = SampleOutcome(sample, answer, is_new=True)
-        new = [outcome.found for outcome in found.values() if isinstance(outcome.found, Answer)]
-        new = [answer for answer in new if self.book.get(flight_of(answer.sample_id), answer.key) is None]
-        await asyncio.gather(*(self.book.put(flight_of(answer.sample_id), answer) for answer in new))
-        return found
+            outcomes[i] = SampleOutcome(batch[i], answer, is_new=True)
+        return [outcomes[i] for i in range(len(batch))]
 
-    def _decode(
-        self, rows: Sequence[tuple[EncodedSample, Sample]], features: Mapping[FramePicture, Tensors]
-    ) -> list[Completion]:
+    def _decode(self, rows: Sequence[tuple[EncodedSample, list[Tensors]]]) -> list[Completion]:
+        """Answer prompts; a batch that does not fit into the memory is halved."""
         import torch
 
-        seen = [features[picture] for _, sample in rows for picture in pictures_of(sample)]
+        seen = [tensors for _, pictures in rows for tensors in pictures]
         try:
             return generate(self.student, [row for row, _ in rows], seen, max_tokens=self.max_tokens)
         except torch.OutOfMemoryError as error:
@@ -263,7 +259,7 @@ class LocalAnswers:
                 raise ConfigError("the memory is full", where=where, got=str(error)[:120], fix=fix) from error
         torch.cuda.empty_cache()  # here, because the exception holds what it refers to
         half = len(rows) // 2
-        return self._decode(rows[:half], features) + self._decode(rows[half:], features)
+        return self._decode(rows[:half]) + self._decode(rows[half:])
 
 
 class EngineAnswers:

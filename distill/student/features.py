@@ -106,34 +106,30 @@ def read_features(
     *,
     is_frozen: bool = True,
     most_bytes: float = math.inf,
-) -> tuple[dict[FramePicture, Tensors], dict[FramePicture, str]]:
-    """Encode pictures as they are read.
+) -> dict[FramePicture, Tensors | str]:
+    """Encode pictures as they are read, and return their features, on the CPU, or the words of an error.
 
     Args:
         read: what `try_to_read` returns for each picture. is_frozen: False keeps the inputs of a tower that is trained.
-        most_bytes: of the features; once they are more, the other pictures are read and not kept.
-
-    Returns:
-        The features of pictures, on the CPU; and why others cannot be read.
+        most_bytes: of the features; once they are more, the other pictures are read for their errors alone.
     """
     import torch
 
-    features: dict[FramePicture, Tensors] = {}
-    errors: dict[FramePicture, str] = {}
+    found: dict[FramePicture, Tensors | str] = {}
     num_bytes = 0
     results = zip(pictures, read, strict=True)
     while part := dict(islice(results, READ_TOGETHER)):
-        errors |= {picture: words for picture, words in part.items() if isinstance(words, str)}
+        found |= {picture: words for picture, words in part.items() if isinstance(words, str)}
         good = {picture: tensors for picture, tensors in part.items() if not isinstance(tensors, str)}
         if num_bytes >= most_bytes:
             continue
         with torch.no_grad():
-            found = encode(student, list(good.values())) if is_frozen else list(good.values())
-        for picture, tensors in zip(good, found, strict=True):
+            encoded = encode(student, list(good.values())) if is_frozen else list(good.values())
+        for picture, tensors in zip(good, encoded, strict=True):
             # A copy, because a tensor of a worker process holds a file open as long as it lives.
-            features[picture] = {name: tensor.to("cpu", copy=True) for name, tensor in tensors.items()}
-            num_bytes += sum(tensor.nbytes for tensor in features[picture].values())
-    return features, errors
+            found[picture] = {name: tensor.to("cpu", copy=True) for name, tensor in tensors.items()}
+            num_bytes += sum(tensor.nbytes for tensor in tensors.values())
+    return found
 
 
 def _encode_together(student: Student, pictures: Sequence[Tensors]) -> list[Tensors]:

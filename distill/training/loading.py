@@ -172,19 +172,20 @@ class TrainingContext:
             read = in_order(self.reader.try_to_read, pictures, self.cfg.data_workers)
             counted = (advance(1) or tensors for tensors in read)
             own: Any = {"is_frozen": not self.cfg.train_vision, "most_bytes": most_bytes}
-            self.features, unreadable = read_features(self.student, pictures, counted, **own)
-        if num_others := len(pictures) - len(self.features) - len(unreadable):
+            found = read_features(self.student, pictures, counted, **own)
+        self.features = {picture: tensors for picture, tensors in found.items() if not isinstance(tensors, str)}
+        if num_others := len(pictures) - len(found):
             words = "%s: the features of %d pictures do not fit into the memory: they are encoded at each use"
             log.warning(words, STAGE, num_others)
         for split in splits:
-            split.skip_unreadable(unreadable)
+            split.skip_unreadable({picture: words for picture, words in found.items() if isinstance(words, str)})
 
     def features_of(self, samples: Iterable[TrainingSample]) -> list[Tensors]:
         """Return the features of the pictures of samples, sample after sample."""
         pictures = [picture for sample in samples for picture in sample.pictures]
         others = [picture for picture in dict.fromkeys(pictures) if picture not in self.features]
         read = map(self.reader.read, others)
-        again, _ = read_features(self.student, others, read, is_frozen=not self.cfg.train_vision)
+        again: Any = read_features(self.student, others, read, is_frozen=not self.cfg.train_vision)
         found = [again[picture] if picture in again else self.features[picture] for picture in pictures]
         return encode(self.student, found) if self.cfg.train_vision else found
 
