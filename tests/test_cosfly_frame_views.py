@@ -24,7 +24,6 @@ from cosfly.llm.student_chat import encoded_image
 from distill.inference.stage import InferConfig, make_request
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample
-from distill.student.chat import load_pictures
 from specimens import make_playback_tree
 
 
@@ -108,7 +107,8 @@ def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, 
     for language in ("en", "zh"):
         sample = make_sample(caption, language, PrepareConfig(modalities=views))
         assert isinstance(sample, Sample)
-        text, pictures = sample.prompt.user, load_pictures(sample, {"": tree})
+        text = sample.prompt.user
+        pictures = [picture for frame in sample.frames for picture in sample.pictures.read(tree / frame)]
         assert PICTURES_MARK not in text
         assert told_views(text, language) == views
         assert len(pictures) == 5 * told_count(text, language) == 5 * len(views)

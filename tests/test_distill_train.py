@@ -33,7 +33,7 @@ from cosfly.runtime.errors import ConfigError
 from distill.inference import stage as infer
 from distill.student import features
 from distill.student import model as student
-from distill.student.chat import IGNORED, load_pictures, padded
+from distill.student.chat import IGNORED, padded
 from distill.student.random_student import END_OF_TURN
 from distill.training import fit, loading
 from distill.training import stage as train
@@ -67,7 +67,8 @@ def test_processor_agrees_with_the_library_one(place):
     images = own.library.image_processor
     oracle = WithoutVideos(images, own.tokenizer, None, chat_template=own.tokenizer.chat_template)
     frames = []
-    for number, picture in enumerate(load_pictures(sample, trees_of(place))):
+    pictures = [sample.pictures.read(place / "tree" / frame)[0] for frame in sample.frames]
+    for number, picture in enumerate(pictures):
         frames += [{"type": "text", "text": f"t{number}:"}, {"type": "image", "image": picture}]
     messages = [
         {"role": "system", "content": [{"type": "text", "text": sample.prompt.system}]},

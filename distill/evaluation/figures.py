@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Self
 
@@ -126,21 +126,15 @@ class Answers:
     @classmethod
     def of_student(cls, predictions: Sequence[Prediction], values: Sequence[ValueCounts | None]) -> Self:
         """Return the answers of a student. values: Of each text, None if nobody compared them with the facts."""
-        cocs = [prediction.coc for prediction in predictions]
-        return cls(
-            decision=np.array(
-                [UNPARSED if p.coc is None else decision_number(p.coc.flight_decision, p.key) for p in predictions]
-            ),
+        decisions = [UNPARSED if p.coc is None else decision_number(p.coc.flight_decision, p.key) for p in predictions]
+        counts = [(v.values_matched, v.values_contradicted) if v else (np.nan, np.nan) for v in values]
+        return replace(
+            cls.of(np.array(decisions), [text_of(prediction.coc) for prediction in predictions]),
             is_answered=np.array([not (p.reason or "").startswith(FAILED) for p in predictions]),
             is_unchanged=np.array([p.coc is not None and not p.recovered for p in predictions]),
             num_tokens=np.array([p.num_tokens for p in predictions], dtype=float),
-            values=np.array([
-                (np.nan, np.nan) if counts is None else (counts.values_matched, counts.values_contradicted)
-                for counts in values
-            ]).reshape(-1, 2),
-            scores=np.full((len(cocs), 3), np.nan),
-            texts=np.array([text_of(coc) for coc in cocs], dtype=object),
-        )  # fmt: skip
+            values=np.array(counts).reshape(-1, 2),
+        )
 
 
 Ratios = dict[str, tuple[np.ndarray, np.ndarray]]  # figure -> what each sample adds to numerator and denominator, (n,)

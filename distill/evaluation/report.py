@@ -127,14 +127,12 @@ def notes_of(report: Evaluation) -> list[str]:
         *NOTES,
     ]
     for language, metric in report.metrics.items():
-        if metric is None:
-            notes.append(f"BERTScore of {language} was not computed, because no encoder was passed.")
-            continue
-        versions = ", ".join(f"{name} {number}" for name, number in metric.versions.items())
-        notes.append(
-            f"BERTScore of {language}: {metric.model}, layer {metric.layer}, not rescaled; {versions}; "
-            f"{metric.cut} references are longer than {metric.max_tokens} tokens."
-        )
+        text = "was not computed, because no encoder was passed."
+        if metric is not None:
+            versions = ", ".join(f"{name} {number}" for name, number in metric.versions.items())
+            text = f"by {metric.model}, layer {metric.layer}, not rescaled; {versions}; "
+            text += f"{metric.cut} references are longer than {metric.max_tokens} tokens."
+        notes.append(f"BERTScore of {language} {text}")
     for name, student in report.students.items():
         facts = [f"{reason}: {count}" for reason, count in student.without_decision.items()]
         if student.samples_per_s is not None:

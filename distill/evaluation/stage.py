@@ -96,13 +96,33 @@ def run(
     if len(splits) != 1:
         fix = "pass predictions of one split"
         raise InputError("the predictions are not of one split", got=", ".join(splits) or "none", fix=fix)
-    samples = list(open_split(dataset, splits[0]))
+    samples, train, values = list(open_split(dataset, splits[0])), open_split(dataset, "train"), read_judged(judged)
     asked = asked_samples(samples, found)
-    students = {
-        name: _student_record(asked, own, len(samples) - len(own), _samples_per_s(files[name].parent))
-        for name, own in found.items()
+    students: dict[str, StudentRecord] = {}
+    for name, own in found.items():
+        answers = [own[sample.key] for sample in asked]
+        reasons = Counter(answer.reason or "unknown" for answer in answers if answer.coc is None)
+        students[name] = StudentRecord(
+            model=", ".join(sorted({answer.model or "unknown" for answer in answers})),
+            not_asked=len(samples) - len(own),
+            without_decision=dict(sorted(reasons.items())),
+            samples_per_s=_samples_per_s(files[name].parent),
+        )
+    by_language = {
+        language: [sample for sample in asked if sample.language == language]
+        for language in sorted({sample.language for sample in asked})
     }
-    report = evaluate(asked, students, found, dataset, encoders, read_judged(judged), seed)
+    most = NUM_EXAMPLES // len(by_language)
+    measured = {
+        language: measure_language(part, found, train, encoders.get(language), values, seed)
+        for language, part in by_language.items()
+    }
+    report = Evaluation(
+        split=splits[0], seed=seed, confidence=CONFIDENCE, resamples=RESAMPLES, students=students,
+        metrics={language: metric for language, (_, metric) in measured.items()},
+        languages={language: measurement for language, (measurement, _) in measured.items()},
+        examples=[example for part in by_language.values() for example in _examples(part, found, most, seed)],
+    )  # fmt: skip
     write_model(out / REPORT, report, REPORT_FORMAT)
     write_bytes(out / "evaluation.md", markdown_of(report).encode())
     write_bytes(out / "evaluation.html", page_of(report).encode())
@@ -126,10 +146,8 @@ def asked_samples(samples: Sequence[Sample], predictions: Predictions) -> list[S
     keys = {sample.key for sample in samples}
     for name, own in predictions.items():
         if unknown := own.keys() - keys:
-            what, fix = (
-                "the split does not contain the sample of a prediction",
-                "pass the training set of the predictions",
-            )
+            what = "the split does not contain the sample of a prediction"
+            fix = "pass the training set of the predictions"
             raise InputError(what, where=f"{name}: {min(unknown)}", got=f"{len(unknown)} such predictions", fix=fix)
     asked = [sample for sample in samples if all(sample.key in own for own in predictions.values())]
     if not asked:
@@ -148,60 +166,31 @@ def read_judged(paths: Sequence[Path]) -> JudgedValues:
     return found
 
 
-def evaluate(
+def measure_language(
     samples: Sequence[Sample],
-    students: dict[str, StudentRecord],
     predictions: Predictions,
-    dataset: Path,
-    encoders: Mapping[Language, Path],
+    train: Collection[Sample],
+    encoder: Path | None,
     judged: JudgedValues,
     seed: int,
-) -> Evaluation:
-    """Measure students, teacher and baselines on samples that all students were asked, in each language."""
-    metrics: dict[Language, Metric | None] = {}
-    measurements: dict[Language, Measurement] = {}
-    examples: list[Example] = []
-    languages = sorted({sample.language for sample in samples})
-    for language in languages:
-        own = [sample for sample in samples if sample.language == language]
-        everyone: dict[str, Answers] = {}
-        for name, of_key in predictions.items():
-            asked = [of_key[sample.key] for sample in own]
-            keys = [(s.window_id, s.language, text_of(p.coc)) for s, p in zip(own, asked, strict=True)]
-            values = [judged.get((s.run, *key)) or judged.get((None, *key)) for s, key in zip(own, keys, strict=True)]
-            everyone[name] = Answers.of_student(asked, values)
-        everyone |= floors_of(open_split(dataset, "train"), own, language, seed)
-        metrics[language] = None
-        if language in encoders:
-            references = [text_of(coc_of(sample)) for sample in own]
-            scorer = Scorer(encoders[language], references)
-            metrics[language] = scorer.metric
-            written = {name: everyone[name].texts.tolist() for name in (*predictions, "majority") if name in everyone}
-            for name, scores in scorer.score(written, references).items():
-                everyone[name].scores[:] = np.where(everyone[name].is_answered[:, None], scores, np.nan)
-        measurements[language] = measure(own, everyone, predictions, rng_for(seed, STAGE, "draws"))
-        examples += _examples(own, predictions, NUM_EXAMPLES // len(languages), seed)
-    return Evaluation(
-        split=next(iter(next(iter(predictions.values())).values())).split,
-        seed=seed,
-        confidence=CONFIDENCE,
-        resamples=RESAMPLES,
-        students=students,
-        metrics=metrics,
-        languages=measurements,
-        examples=examples,
-    )
-
-
-def _student_record(
-    samples: Sequence[Sample], own: Mapping[str, Prediction], not_asked: int, samples_per_s: float | None
-) -> StudentRecord:
-    answers = [own[sample.key] for sample in samples]
-    reasons = Counter(answer.reason or "unknown" for answer in answers if answer.coc is None)
-    model = ", ".join(sorted({answer.model or "unknown" for answer in answers}))
-    return StudentRecord(
-        model=model, not_asked=not_asked, without_decision=dict(sorted(reasons.items())), samples_per_s=samples_per_s
-    )
+) -> tuple[Measurement, Metric | None]:
+    """Measure students, teacher and baselines on samples of one language that all students were asked."""
+    everyone: dict[str, Answers] = {}
+    for name, own in predictions.items():
+        asked = [own[sample.key] for sample in samples]
+        keys = [(s.window_id, s.language, text_of(p.coc)) for s, p in zip(samples, asked, strict=True)]
+        values = [judged.get((s.run, *key)) or judged.get((None, *key)) for s, key in zip(samples, keys, strict=True)]
+        everyone[name] = Answers.of_student(asked, values)
+    everyone |= floors_of(train, samples, samples[0].language, seed)
+    metric = None
+    if encoder is not None:
+        references = [text_of(coc_of(sample)) for sample in samples]
+        scorer = Scorer(encoder, references)
+        metric = scorer.metric
+        written = {name: everyone[name].texts.tolist() for name in (*predictions, "majority") if name in everyone}
+        for name, scores in scorer.score(written, references).items():
+            everyone[name].scores[:] = np.where(everyone[name].is_answered[:, None], scores, np.nan)
+    return measure(samples, everyone, predictions, rng_for(seed, STAGE, "draws")), metric
 
 
 def _examples(samples: Sequence[Sample], predictions: Predictions, most: int, seed: int) -> Iterator[Example]:

@@ -11,7 +11,7 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_folder
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from distill.student.model import GGUF, load_config, load_student, loading_errors, require, student_path, weight_files
-from distill.student.saving import check_adapter, write_model_folder
+from distill.student.saving import check_adapter, write_student
 
 STAGE = "distill.merge"
 
@@ -45,7 +45,7 @@ def run(model: Path, adapter: Path, out: Path, *, resume: Resume = "if-same") ->
     if dtype is not None:
         student.model.to(dtype)
     with atomic_folder(merged) as partial:
-        write_model_folder(student, partial, model)
+        write_student(student, partial, model)
         shutil.copyfile(adapter / CHAT_FORMAT_FILE, partial / CHAT_FORMAT_FILE)
     stage.finish([path for path in merged.iterdir() if path.is_file()], Tally(input=1, kept=1))
     return merged

@@ -32,12 +32,12 @@ from cosfly.llm.vllm_engine import VllmConfig, VllmEngine
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.console import Advance, progress_bar
 from cosfly.runtime.errors import ConfigError, InputError, TeacherError
-from cosfly.runtime.io import atomic_file, sha256_bytes
+from cosfly.runtime.io import atomic_file, inside, sha256_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.model_json import CONTEXT_FULL
 from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, read_manifest, read_stage_record, write_failures
 from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
-from distill.student.chat import EncodedSample, load_pictures
+from distill.student.chat import EncodedSample
 from distill.student.features import PictureReader, Tensors, pictures_of, read_features
 from distill.student.generate import Completion, generate
 from distill.student.model import Device, load_student, require, student_path, weight_files
@@ -53,8 +53,8 @@ def make_request(
     sample: Sample, trees: Mapping[str, Path], sampling: StudentEndpointConfig, max_pixels: int
 ) -> Request:
     """Return a sample as chat messages: its pictures as the student was taught to see them, then the question."""
-    pictures = iter([picture_to_send(picture, max_pixels) for picture in load_pictures(sample, trees)])
-    frames = [[next(pictures) for _ in sample.views] for _ in sample.frames]
+    folders = [inside(trees[sample.run], frame) for frame in sample.frames]
+    frames = [[picture_to_send(view, max_pixels) for view in sample.pictures.read(folder)] for folder in folders]
     schema = answer_schema(language=sample.language, place=decision_place(sample.answer))
     return student_request(sample.prompt, frames, schema, sampling)
 

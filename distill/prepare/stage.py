@@ -100,13 +100,11 @@ def make_sample(
     is_noisy = caption.label_from == "perturbed"  # and so are the decisions that this future rules out
     ruled_out = caption.checks.contradicted
     return Sample(
+        **{name: getattr(caption, name) for name in ("town", "trajectory", "variant")},
         sample_id=sample_id or caption.sample_id,
         language=language,
         run=run,
         window_id=caption.sample_id,
-        town=caption.town,
-        trajectory=caption.trajectory,
-        variant=caption.variant,
         walk=walk,
         window=tuple(caption.window),
         views=pictures.views,

@@ -19,7 +19,6 @@ from PIL import Image
 
 from cosfly.llm.student_chat import IMAGE_PART, chat_messages, limited_size
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import inside
 from distill.schema import Sample
 
 IGNORED = -100  # label of tokens without a loss, the convention of PyTorch's cross entropy
@@ -151,9 +150,10 @@ class Processor:
             words = "the tokenizer has no end token, and the chat template ends no answer with one"
             raise InputError(words, where=where, fix='name an "eos_token" in tokenizer_config.json')
 
-    def _content(self, text: str) -> Any:
-        """Return a text as the content of a message: templates of families with pictures take lists of parts."""
-        return [{"type": "text", "text": text}] if self.has_pictures else text
+    def _content(self, content: str | list[dict[str, Any]]) -> Any:
+        """Return the content of a message: parts for templates of families with pictures, otherwise text."""
+        parts = [{"type": "text", "text": content}] if isinstance(content, str) else content
+        return parts if self.has_pictures else "".join(part["text"] for part in parts)
 
     def _render(self, messages: list[dict[str, Any]], **more: Any) -> str:
         given: dict[str, Any] = {"tokenize": False, "enable_thinking": False, **more}
@@ -161,16 +161,8 @@ class Processor:
 
     def _messages(self, sample: Sample) -> list[dict[str, Any]]:
         """Return the chat of a sample, with a mark for each picture."""
-        frames = [[IMAGE_PART] * len(sample.views) for _ in sample.frames]
-        found = []
-        for message in chat_messages(sample.prompt, frames):
-            content = message["content"]
-            if self.has_pictures:
-                content = self._content(content) if isinstance(content, str) else content
-            elif not isinstance(content, str):
-                content = "".join(part["text"] for part in content)
-            found.append(message | {"content": content})
-        return found
+        messages = chat_messages(sample.prompt, [[IMAGE_PART] * len(sample.views) for _ in sample.frames])
+        return [message | {"content": self._content(message["content"])} for message in messages]
 
     def prompt_text(self, sample: Sample) -> str:
         """Return the prompt as the chat template writes it, without thinking, with one mark for each picture."""
@@ -247,16 +239,6 @@ def _token_weights(text: str, tokens: Mapping[str, Any], weights: FieldWeights) 
             begins, ends = np.array(tokens["offset_mapping"]).reshape(-1, 2).T
             found[:-1][(ends > key.end()) & (begins < end - 1)] = weight
     return found
-
-
-def load_pictures(sample: Sample, trees: Mapping[str, Path]) -> list[np.ndarray]:
-    """Load the pictures of a sample as its teacher saw them, each (h, w, 3) uint8 RGB.
-
-    Args:
-        trees: run -> playback tree (`resolve_trees`).
-    """
-    tree = trees[sample.run]
-    return [picture for frame in sample.frames for picture in sample.pictures.read(inside(tree, frame))]
 
 
 def special_token_in(processor: Processor, sample: Sample) -> str | None:

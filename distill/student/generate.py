@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from distill.student.chat import EncodedSample, prompt_batch
 from distill.student.features import Tensors, shown
 from distill.student.model import Student
 
 
-@dataclass(frozen=True)
-class Completion:
+class Completion(NamedTuple):
     """An answer. num_tokens: without its end token. is_finished: it ended by itself."""
 
     text: str
@@ -20,11 +19,7 @@ class Completion:
 
 
 def generate(
-    student: Student,
-    rows: Sequence[EncodedSample],
-    pictures: Sequence[Tensors],
-    *,
-    max_tokens: int,
+    student: Student, rows: Sequence[EncodedSample], pictures: Sequence[Tensors], *, max_tokens: int
 ) -> list[Completion]:
     """Answer a batch of prompts greedily; the answers in `rows` are not used.
 
@@ -51,16 +46,10 @@ def generate(
         cache_implementation="static" if is_one_type else "dynamic",
         disable_compile=True,  # a compiled step holds for one batch size and length, and costs a minute
     )
-    # Settings for sampling that a model folder may bring would complete those of `config`.
-    own, was_training = core.generation_config, student.model.training
-    core.generation_config = config
+    core.generation_config = config  # settings for sampling of the model folder would complete those of `config`
     student.model.eval()
-    try:
-        with torch.inference_mode(), student.computing(), shown(student, pictures) as seen:
-            found = core.generate(**inputs, **seen)
-    finally:
-        core.generation_config = own
-        student.model.train(was_training)
+    with torch.inference_mode(), student.computing(), shown(student, pictures) as seen:
+        found = core.generate(**inputs, **seen)
     completions = []
     for tokens in found[:, num_prompt:].tolist():
         written = tokens[: tokens.index(end)] if end in tokens else tokens

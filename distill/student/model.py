@@ -6,7 +6,6 @@ A student is a folder, the name of a repository on a hub, or a GGUF file. Only `
 from __future__ import annotations
 
 import contextlib
-import importlib
 import importlib.util
 import inspect
 import logging
@@ -20,6 +19,7 @@ from typing import Any, Literal
 from cosfly.runtime.errors import CosflyError, EnvironmentMissing, InputError
 from cosfly.runtime.io import read_text
 from cosfly.runtime.json_io import read_json, read_object
+from distill.student import qwen3_5
 from distill.student.chat import Processor
 
 log = logging.getLogger(__name__)
@@ -29,7 +29,6 @@ HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
 MODEL_FILES = ["*.json", "*.safetensors", "*.jinja", "*.txt", "*.model"]  # of a repository; none of them is code
 GGUF = ".gguf"
 TEMPLATE = "chat_template.jinja"
-FAST_FAMILIES = {"qwen3_5": "distill.student.qwen3_5"}  # families with faster code of ours
 Device = Literal["auto", "cpu", "cuda"]
 Dtype = Literal["auto", "float32", "bfloat16"]
 
@@ -175,14 +174,12 @@ def load_config(path: Path, *, allow_code: bool = False) -> Any:
         return AutoConfig.from_pretrained(**arguments)
 
 
-def model_class(config: Any) -> Any:
-    """Return the Auto class of a student: image and text to text if it is a vision-language model, otherwise text."""
-    from transformers import AutoModelForCausalLM, AutoModelForImageTextToText
+def is_vision_language(config: Any) -> bool:
+    """Return whether a student is a model for images and text, and not one for text alone."""
     from transformers.models.auto.modeling_auto import MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING
 
-    sees = type(config) in MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING
     own = getattr(config, "auto_map", None) or {}
-    return AutoModelForImageTextToText if sees or "AutoModelForImageTextToText" in own else AutoModelForCausalLM
+    return type(config) in MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING or "AutoModelForImageTextToText" in own
 
 
 def _picture_processor(config: Any, tokenizer: Any, arguments: dict[str, Any]) -> Any:
@@ -238,25 +235,26 @@ def load_student(
     weight_files(path)
     import torch
     from peft import PeftModel
-    from transformers import AutoModelForImageTextToText, AutoTokenizer
+    from transformers import AutoModelForCausalLM, AutoModelForImageTextToText, AutoTokenizer
 
     quiet_transformers()
     device_name = pick_device(device)
     computed = compute_dtype(dtype, device_name)
     config, arguments = load_config(path, allow_code=allow_code), _arguments(path, allow_code)
-    auto_class = model_class(config)
+    sees = is_vision_language(config)
     with loading_errors("tokenizer of the student", path):
         tokenizer: Any = AutoTokenizer.from_pretrained(**arguments)
     library = None
-    if auto_class is AutoModelForImageTextToText and hasattr(config, "vision_config"):
+    if sees and hasattr(config, "vision_config"):
         with loading_errors("processor of the student", path):
             library = _picture_processor(config, tokenizer, arguments)
     if not template and adapter is not None and (adapter / TEMPLATE).is_file():
         template = read_text(adapter / TEMPLATE, what="chat template")
     Processor(tokenizer, library, template).check(path)
-    family = importlib.import_module(FAST_FAMILIES[config.model_type]) if config.model_type in FAST_FAMILIES else None
-    if family is not None:
-        family.choose_kernels(computed, device_name)
+    is_fast = config.model_type == qwen3_5.MODEL_TYPE
+    if is_fast:
+        qwen3_5.choose_kernels(computed, device_name)
+    auto_class: Any = AutoModelForImageTextToText if sees else AutoModelForCausalLM
     dtypes: Any = {"dtype": torch.float32 if is_trained else computed, "use_safetensors": True}
     with loading_errors("student", adapter or path):
         model, info = auto_class.from_pretrained(**arguments, **dtypes, output_loading_info=True)
@@ -275,6 +273,6 @@ def load_student(
                 model = PeftModel.from_pretrained(model, adapter)
     model.to(device_name)
     student = Student(tokenizer, library, template, model=model, device=device_name, dtype=computed)
-    if family is not None and device_name == "cuda":
-        family.fuse_norms(student.core)
+    if is_fast and device_name == "cuda":
+        qwen3_5.fuse_norms(student.core)
     return student

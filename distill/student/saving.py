@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_file, storage_errors, write_bytes
-from cosfly.runtime.json_io import FileFormat, read_model, read_object, write_json, write_model
+from cosfly.runtime.json_io import FileFormat, read_model, write_model
 from distill.student.model import GGUF, TEMPLATE, Student, weight_files
 
 ADAPTER_FACTS, ADAPTER_FORMAT = "cosfly_adapter.json", FileFormat("cosfly.adapter", "1.0", "adapter")
@@ -51,44 +51,35 @@ def save_tensors(path: Path, tensors: Mapping[str, Any], metadata: dict[str, str
         os.replace(partial, path)
 
 
-def write_adapter(student: Student, folder: Path, base: Path, base_name: str) -> None:
-    """Write an adapter that peft loads, and what it belongs to.
+def write_student(student: Student, folder: Path, base: Path, base_name: str = "") -> None:
+    """Write an adapter that peft loads, or a whole model that transformers and vLLM load.
 
     Args:
-        base_name: name of the base in place of its path on this machine, which peft writes.
+        base: its folder, whose other files a whole model gets as they are, or the GGUF file that it was read from.
+        base_name: name of the base in an adapter, in place of its path on this machine, which peft writes.
     """
+    adapters = getattr(student.model, "peft_config", {})
+    for config in adapters.values():
+        config.base_model_name_or_path = base_name
+    files = {path for pattern in COPIED for path in base.glob(pattern)} if base.is_dir() and not adapters else set()
+    for path in sorted(files):
+        if path.is_file() and "safetensors" not in path.name:
+            shutil.copyfile(path, folder / path.name)  # the content, because a hub's cache has links
+    more = {"save_embedding_layers": False} if adapters else {}  # peft would look for the base on the hub
     with writing_errors(folder):
-        student.model.save_pretrained(folder)
+        student.model.save_pretrained(folder, **more)
+        if not base.is_dir() and not adapters:
+            student.tokenizer.save_pretrained(folder)
     if student.template:
         write_bytes(folder / TEMPLATE, student.template.encode())
-    (folder / "README.md").unlink(missing_ok=True)
-    path = folder / "adapter_config.json"
-    write_json(path, read_object(path, what="adapter") | {"base_model_name_or_path": base_name})
-    write_adapter_facts(folder, base)
+    if adapters:
+        (folder / "README.md").unlink(missing_ok=True)
+        write_adapter_facts(folder, base)
 
 
 def write_adapter_facts(folder: Path, base: Path) -> None:
     """Write which base an adapter belongs to."""
     write_model(folder / ADAPTER_FACTS, AdapterFacts(base_sha256=base_digests(base)), ADAPTER_FORMAT)
-
-
-def write_model_folder(student: Student, folder: Path, base: Path) -> None:
-    """Write a whole model that transformers and vLLM load: its weights, and the other files of its base as they are.
-
-    Args:
-        student: a model without an adapter next to its weights.
-        base: its folder, or the GGUF file that it was read from.
-    """
-    if base.is_dir():
-        for path in sorted({path for pattern in COPIED for path in base.glob(pattern)}):
-            if path.is_file() and "safetensors" not in path.name:
-                shutil.copyfile(path, folder / path.name)  # the content, because a hub's cache has links
-    with writing_errors(folder):
-        student.model.save_pretrained(folder)
-        if not base.is_dir():
-            student.tokenizer.save_pretrained(folder)
-    if student.template:
-        write_bytes(folder / TEMPLATE, student.template.encode())
 
 
 def base_digests(model: Path) -> dict[str, str]:

@@ -72,15 +72,10 @@ def make_optimizer(student: Student, cfg: TrainConfig) -> Any:
 
 
 def add_gradients(parameters: Sequence[Any], accelerator: Any) -> None:
-    """Add up the gradients of all processes, in place."""
-    import torch
-
-    if accelerator.num_processes == 1:
-        return
-    for parameter in parameters:
-        if parameter.grad is None:  # this process has no sample in the step
-            parameter.grad = torch.zeros_like(parameter)
-        torch.distributed.all_reduce(parameter.grad)
+    """Add up the gradients of all processes, of which some may have no sample in the step."""
+    for parameter in parameters if accelerator.num_processes > 1 else ():
+        own = parameter.new_zeros(parameter.shape) if parameter.grad is None else parameter.grad
+        parameter.grad = accelerator.reduce(own, "sum")
 
 
 def train_step(

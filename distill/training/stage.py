@@ -28,7 +28,7 @@ from distill.student.chat import check_template
 from distill.student.features import PictureReader
 from distill.student.model import Student, is_hub_name, load_student, pick_device, require, student_path, weight_files
 from distill.student.random_student import RANDOM, TINY, TINY_STUDENT, make_random_student
-from distill.student.saving import write_adapter, write_model_folder
+from distill.student.saving import write_student
 from distill.training.checkpoints import learning_weights
 from distill.training.fit import LOG, fit, seeded
 from distill.training.loading import TrainingContext, TrainingSplit
@@ -233,13 +233,17 @@ def run(
         if broadcast_object_list([folder is not None and folder.is_complete])[0]:
             return product
         accelerator.init_trackers(STAGE)
-        context = _context(cfg, dataset, trees, base, seed, accelerator)
+        context, taught = _context(cfg, dataset, trees, base, seed, accelerator)
         progress = fit(context, out)
         if folder is not None:
             used = context.train.used
             skipped = Counter({reason: len(found) for reason, found in context.train.skipped.items()})
             tally = Tally(input=len(used) + skipped.total(), kept=len(used), dropped=skipped)
-            _write_product(context, product, base, base_name)
+            if cfg.method == "full":
+                context.student.model.to(context.student.dtype)
+            with atomic_folder(product) as partial:
+                write_student(context.student, partial, base, base_name)
+                write_chat_format(partial, taught)
             folder.finish(
                 [out / LOG, *sorted(product.iterdir())],
                 tally,
@@ -263,7 +267,7 @@ def _texts(samples: Sequence[Sample]) -> Iterator[str]:
 
 def _context(
     cfg: TrainConfig, dataset: Path, trees: dict[str, Path], base: Path, seed: int, accelerator: Any
-) -> TrainingContext:
+) -> tuple[TrainingContext, ChatFormat]:
     """Load the student and the data, check them, and log what will be trained."""
     student = prepared_student(cfg, base, seed, pick_device(cfg.device))
     samples, validation = (open_split(dataset, split, text_only=not student.has_pictures) for split in TAUGHT)
@@ -274,7 +278,7 @@ def _context(
         log.warning("%s: the student takes no pictures: it is taught with the text state alone", STAGE)
     check_template(student, samples[0])
     check_head(student)
-    taught_by(samples, cfg.max_pixels)  # its errors come before the training
+    taught = taught_by(samples, cfg.max_pixels)  # its errors come before the training
     weights = {"flight_decision": cfg.decision_weight, "reasoning_trace": cfg.reason_weight}
     train, val = (TrainingSplit(part, student, cfg.max_pixels, weights) for part in (samples, validation))
     order = rng_for(seed, STAGE, "validation").permutation(len(validation))
@@ -293,15 +297,4 @@ def _context(
     if not train.used:
         words, got = "no sample can be used for training", ", ".join(train.skipped)
         raise InputError(words, where=dataset, got=got, fix="read the warnings above, and change the settings")
-    return context
-
-
-def _write_product(context: TrainingContext, product: Path, base: Path, base_name: str) -> None:
-    student, taught = context.student, taught_by(context.train.samples, context.cfg.max_pixels)
-    with atomic_folder(product) as partial:
-        if context.cfg.method == "lora":
-            write_adapter(student, partial, base, base_name)
-        else:
-            student.model.to(student.dtype)
-            write_model_folder(student, partial, base)
-        write_chat_format(partial, taught)
+    return context, taught
