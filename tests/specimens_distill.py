@@ -13,8 +13,7 @@ from cosfly.llm.student_chat import ChatFormat, FrameFormat, write_chat_format
 from cosfly.runtime.json_io import write_model
 from cosfly.runtime.run_dir import fingerprint
 from distill.prepare import stage as prepare
-from distill.prepare.sources import RunSource
-from distill.prepare.stage import PrepareConfig
+from distill.prepare.stage import PrepareConfig, RunSource
 from distill.schema import RECORD, RECORD_FORMAT, Sample, SourceTree, SplitWriter, TrainingSet
 
 WINDOW = 5

@@ -33,8 +33,8 @@ from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.json_io import read_json, write_json
 from cosfly.runtime.run_dir import read_failures
 from distill.prepare import stage as prepare
-from distill.prepare.sources import RunSource as Prepared
 from distill.prepare.stage import PrepareConfig
+from distill.prepare.stage import RunSource as Prepared
 from distill.schema import SPLITS, open_split
 from release.build import stage as package
 from release.build.config import ReleaseConfig

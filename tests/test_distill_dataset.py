@@ -17,8 +17,7 @@ from cosfly.geometry.splits import SPLITS
 from cosfly.inspection.blind_baseline import past_of
 from cosfly.runtime.errors import InputError, ResumeError
 from distill.prepare import stage
-from distill.prepare.sources import RunSource
-from distill.prepare.stage import PrepareConfig, make_sample
+from distill.prepare.stage import PrepareConfig, RunSource, make_sample
 from distill.schema import Sample, open_split, resolve_trees, split_path
 from specimens import make_playback_tree
 

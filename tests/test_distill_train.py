@@ -38,9 +38,9 @@ from distill.student.random_student import END_OF_TURN
 from distill.training import fit, loading
 from distill.training import stage as train
 from distill.training.checkpoints import Progress, load_checkpoint, newest_checkpoint
-from distill.training.fit import judged
+from distill.training.fit import count_steps, judged, steps_from
 from distill.training.loading import TrainingContext
-from distill.training.settings import TrainConfig, count_steps, steps_from
+from distill.training.settings import TrainConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

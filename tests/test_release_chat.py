@@ -13,7 +13,7 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.config import build as build_config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.png import png_size
-from distill.prepare.sources import RunSource
+from distill.prepare.stage import RunSource
 from release.export.stage import ExportConfig
 from release.export.stage import run as export
 from release.record import read_record

@@ -29,7 +29,7 @@ def prepare(
     data: options.Trees = None,
 ) -> None:
     """Make a training set from the captions of one or more runs, with splits that share no pedestrian."""
-    from distill.prepare.sources import RunSource
+    from distill.prepare.stage import RunSource
 
     sources = [RunSource.of_run(folder) for folder in options.each_run(runs)]
     if captions or data or not sources:

@@ -22,7 +22,7 @@ from cosfly.geometry.splits import SPLITS, Course, walks_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, fingerprint, write_failures
-from distill.prepare.sources import SplitConfig, check_names, run_of
+from distill.prepare.stage import SplitConfig, check_names, run_of
 from distill.schema import SourceTree, SplitMember, SplitWriter, tree_inputs, write_page
 
 STAGE = "distill.dual_track"

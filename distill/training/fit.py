@@ -16,6 +16,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import ConfigError, InputError, ResumeError
 from cosfly.runtime.io import sha256_bytes, storage_errors
@@ -34,21 +36,49 @@ from distill.training.checkpoints import (
 )
 from distill.training.loading import TrainingContext, TrainingSample
 from distill.training.loss import answer_loss
-from distill.training.settings import (
-    LOGIT_CHUNK,
-    MAX_GRADIENT_NORM,
-    STAGE,
-    TrainConfig,
-    count_steps,
-    learning_rate_at,
-    share_of,
-    steps_from,
-)
+from distill.training.settings import STAGE, TrainConfig
 
 log = logging.getLogger(__name__)
 
 LOG, CHECKPOINTS = "log.jsonl", "checkpoints"
+LOGIT_CHUNK = 512  # answer tokens whose logits exist at a time
+MAX_GRADIENT_NORM = 1.0  # gradients are scaled down to this norm
+WARMUP_FRACTION = 0.03  # share of the steps with a rising learning rate
 Note = Callable[[dict[str, Any]], None]
+
+
+def count_steps(cfg: TrainConfig, num_samples: int) -> tuple[int, int]:
+    """Return the number of steps, and of those of an epoch."""
+    per_epoch = math.ceil(num_samples / cfg.samples_per_step)
+    return min(cfg.epochs * per_epoch, cfg.max_steps or cfg.epochs * per_epoch), per_epoch
+
+
+def steps_from(cfg: TrainConfig, num_samples: int, seed: int, first: int) -> Iterator[list[int]]:
+    """Yield the sample indices of each step from one on: an epoch is a permutation, cut into steps."""
+    size, (num_steps, per_epoch) = cfg.samples_per_step, count_steps(cfg, num_samples)
+    for epoch in range(first // per_epoch, cfg.epochs):
+        order = rng_for(seed, STAGE, f"epoch_{epoch}").permutation(num_samples).tolist()
+        for step in range(max(first, epoch * per_epoch), min(num_steps, (epoch + 1) * per_epoch)):
+            start = step % per_epoch * size
+            yield order[start : start + size]
+
+
+def share_of(chosen: Sequence[int], lengths: np.ndarray, rank: int, num_ranks: int) -> list[int]:
+    """Return a process's samples of a step, longest first: dealt out by length, so that all have about the same to do.
+
+    Args:
+        chosen: the step's samples. lengths: (n,) tokens of every sample.
+    """
+    return sorted(chosen, key=lambda index: (-int(lengths[index]), index))[rank::num_ranks]
+
+
+def learning_rate_at(cfg: TrainConfig, step: int, num_steps: int) -> float:
+    """Return the learning rate of a step: a linear rise, then a half cosine to zero."""
+    warmup = math.ceil(WARMUP_FRACTION * num_steps)
+    if step < warmup:
+        return cfg.learning_rate * (step + 1) / warmup
+    share = (step - warmup) / max(1, num_steps - warmup)
+    return cfg.learning_rate * 0.5 * (1.0 + math.cos(math.pi * share))
 
 
 @contextlib.contextmanager
