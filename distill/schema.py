@@ -24,7 +24,7 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_file, write_bytes
 from cosfly.runtime.json_io import FileFormat, Record, dump_json, read_model, validated
 from cosfly.runtime.run_dir import fingerprint
-from cosfly.runtime.tables import TableRows
+from cosfly.runtime.tables import rows_of
 from cosfly.viz.frame_views import VIEW_FILES, Pictures, View
 
 RECORD, RECORD_FORMAT = "training_set.json", FileFormat("cosfly.training_set", "5.0", "training set")
@@ -156,34 +156,12 @@ def split_path(dataset: Path, split: str) -> Path:
     return dataset / f"{split}.parquet"
 
 
-class Samples(Sequence[Sample]):
-    """The samples of a split, by number or in order. Keeps a few row groups in memory; each process opens the file.
-
-    text_only: samples come without their pictures.
-    """
-
-    def __init__(self, dataset: Path, split: Split, *, text_only: bool = False) -> None:
-        self.text_only, self.path = text_only, split_path(dataset, split)
-        has_file = read_training_set(dataset).samples.get(split)
-        self._rows: Sequence[dict[str, Any]] = TableRows(self.path, columns_of(Sample).names) if has_file else ()
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def __iter__(self) -> Iterator[Sample]:
-        return (self._sample(number, row) for number, row in enumerate(self._rows))
-
-    def __getitem__(self, number: int) -> Sample:  # type: ignore[override]  # one sample at a time
-        return self._sample(number, self._rows[number])
-
-    def _sample(self, number: int, row: dict[str, Any]) -> Sample:
-        sample = validated(Sample, row, f"{self.path}: row {number}")
-        return sample.without_pictures() if self.text_only else sample
-
-
-def open_split(dataset: Path, split: Split, *, text_only: bool = False) -> Samples:
-    """Open a split; `text_only` for a student that takes no pictures."""
-    return Samples(dataset, split, text_only=text_only)
+def open_split(dataset: Path, split: Split, *, text_only: bool = False) -> list[Sample]:
+    """Read the samples of a split; `text_only` for a student that takes no pictures: they come without them."""
+    path, has_file = split_path(dataset, split), read_training_set(dataset).samples.get(split)
+    rows = rows_of(path, columns_of(Sample).names) if has_file else ()
+    samples = (validated(Sample, row, f"{path}: row {number}") for number, row in enumerate(rows))
+    return [sample.without_pictures() if text_only else sample for sample in samples]
 
 
 class SplitWriter:

@@ -59,7 +59,7 @@ def make_caption(town: str, trajectory: str, variant: str, frame: int, **changes
 
 def prepared(tree: Path, captions: Path, out: Path, *, seed: int = 0, **settings: Any) -> Path:
     cfg = PrepareConfig.model_validate(settings)
-    return prepare.run(cfg, [RunSource.of_files(tree, captions)], out, seed=seed)
+    return prepare.run(cfg, [RunSource(tree, captions)], out, seed=seed)
 
 
 def write_set(out: Path, splits: Mapping[Split, Iterable[Sample]], trees: Iterable[Path] = ()) -> Path:

@@ -225,7 +225,7 @@ def way(tmp_path_factory) -> Path:
     captions = caption_stage.run(KEPT, tree, root / "caption")
     for split_by in ("walk", "town"):
         cfg = PrepareConfig(val_fraction=0, test_fraction=0.5, split_by=split_by, verdicts=get_args(Verdict))
-        prepare.run(cfg, [Prepared.of_files(tree, captions)], root / f"by_{split_by}")
+        prepare.run(cfg, [Prepared(tree, captions)], root / f"by_{split_by}")
     theirs = ReleaseConfig(licence="cc-by-4.0", credits="Made by somebody else.")
     package.run(theirs, [Source("theirs", tree, captions, inspected)], root / "release")
     return root

@@ -153,7 +153,7 @@ def test_the_walk_of_a_flight_decides_its_split_and_not_its_name(tmp_path):
         for folder in sorted(tree.glob(f"{town}/trajectory_*")):  # another second of the same walk
             folder.rename(folder.with_name(f"trajectory_{int(folder.name[11:]) + shift}"))
         make_captions(run / "captions.jsonl", tree)
-        runs.append(RunSource.of_files(tree, run / "captions.jsonl"))
+        runs.append(RunSource(tree, run / "captions.jsonl"))
     cfg = PrepareConfig(val_fraction=0.25, test_fraction=0.25)
     out = stage.run(cfg, runs, tmp_path / "set")
     samples = {split: list(open_split(out, split)) for split in SPLITS}

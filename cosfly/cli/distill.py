@@ -36,7 +36,7 @@ def prepare(
         trees = job.trees(data)
         if len(trees) != len(captions or []):
             raise typer.BadParameter("pass one --captions for each --data, or pass run directories")
-        sources += [RunSource.of_files(*files) for files in zip(trees, captions or [], strict=True)]
+        sources += [RunSource(*files) for files in zip(trees, captions or [], strict=True)]
     job.run("distill.prepare.stage", job.cfg.distill.prepare, sources, out)
 
 

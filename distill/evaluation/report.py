@@ -12,7 +12,17 @@ from cosfly.runtime.json_io import FileFormat, Record
 from cosfly.viz.page import page
 from cosfly.viz.tables import TextTable
 from distill.evaluation.bertscore import Metric
-from distill.evaluation.figures import BERTSCORE, BINS, FIGURES, TEACHER, UNPARSED_NAME, FigureSet, Measurement
+from distill.evaluation.figures import (
+    BERTSCORE,
+    BINS,
+    CONFIDENCE,
+    FIGURES,
+    RESAMPLES,
+    TEACHER,
+    UNPARSED_NAME,
+    FigureSet,
+    Measurement,
+)
 
 REPORT, REPORT_FORMAT = "report.json", FileFormat("cosfly.distill_report", "4.0", "report")
 LANGUAGES: dict[Language, str] = {"en": "English", "zh": "Chinese"}
@@ -69,8 +79,8 @@ class Evaluation(Record):
 
     split: Split
     seed: int
-    confidence: float
-    resamples: int
+    confidence: float = CONFIDENCE
+    resamples: int = RESAMPLES
     students: dict[str, StudentRecord]
     metrics: dict[Language, Metric | None]
     languages: dict[Language, Measurement]

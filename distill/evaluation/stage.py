@@ -24,8 +24,6 @@ from cosfly.runtime.run_dir import Resume, StageFolder, Tally, read_manifest
 from cosfly.runtime.seeding import rng_for
 from distill.evaluation.bertscore import Metric, Scorer, encoder_files
 from distill.evaluation.figures import (
-    CONFIDENCE,
-    RESAMPLES,
     TEACHER,
     Answers,
     Measurement,
@@ -96,7 +94,7 @@ def run(
     if len(splits) != 1:
         fix = "pass predictions of one split"
         raise InputError("the predictions are not of one split", got=", ".join(splits) or "none", fix=fix)
-    samples, train, values = list(open_split(dataset, splits[0])), open_split(dataset, "train"), read_judged(judged)
+    samples, train, values = open_split(dataset, splits[0]), open_split(dataset, "train"), read_judged(judged)
     asked = asked_samples(samples, found)
     students: dict[str, StudentRecord] = {}
     for name, own in found.items():
@@ -118,7 +116,7 @@ def run(
         for language, part in by_language.items()
     }
     report = Evaluation(
-        split=splits[0], seed=seed, confidence=CONFIDENCE, resamples=RESAMPLES, students=students,
+        split=splits[0], seed=seed, students=students,
         metrics={language: metric for language, (_, metric) in measured.items()},
         languages={language: measurement for language, (measurement, _) in measured.items()},
         examples=[example for part in by_language.values() for example in _examples(part, found, most, seed)],

@@ -374,11 +374,11 @@ def run(
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=files, seed=0, resume=resume)
     if stage.is_complete:
         return out / PREDICTIONS
-    split = open_split(dataset, cfg.split)
-    if not len(split):
+    samples = open_split(dataset, cfg.split)[: cfg.max_samples or None]
+    if not samples:
         fix = "pass --set distill.infer.split=val, or prepare more pedestrian trajectories"
         raise InputError("the split is empty", where=dataset, got=cfg.split, fix=fix)
-    given = Inputs([*islice(split, cfg.max_samples)] if cfg.max_samples else split, trees, model, adapter)
+    given = Inputs(samples, trees, model, adapter)
     start_s = time.monotonic()
     name = str(cfg.endpoint.model) if cfg.engine == "endpoint" else given.name
     results = asyncio.run(_answer_all(cfg, given, out, name))

@@ -46,11 +46,14 @@ PAGE_TEXT = "`prompt` is the question, `answer` the expected answer. No two spli
 
 @dataclass(frozen=True)
 class RunSource:
-    """The part of one run: its name, playback tree and captions."""
+    """The part of one run: its playback tree and captions."""
 
-    run: str
     data: Path
     captions: Path
+
+    @property
+    def run(self) -> str:
+        return run_of(self.data)
 
     @classmethod
     def of_run(cls, folder: Path) -> RunSource:
@@ -61,11 +64,7 @@ class RunSource:
             raise InputError(what, where=folder, expected="the folders render/ and caption/", fix=fix)
         captions = folder / "caption/captions.jsonl"
         check_stays_below(captions, captions.parent)
-        return cls.of_files(folder / "render", captions)
-
-    @classmethod
-    def of_files(cls, data: Path, captions: Path) -> RunSource:
-        return cls(run_of(data), data, captions)
+        return cls(folder / "render", captions)
 
 
 def run_of(tree: Path) -> str:
@@ -147,12 +146,12 @@ class PrepareConfig(SplitConfig):
 
 
 def make_sample(
-    caption: Caption, language: Language, cfg: PrepareConfig, *, run: str = "", walk: str = "", sample_id: str = ""
+    caption: Caption, language: Language, cfg: PrepareConfig, *, run: str = "", sample_id: str = ""
 ) -> Sample | str:
-    """Return the sample of a caption in one language, or the reason why there is none.
+    """Return the sample of a caption in one language, or the reason why there is none; its walk is not known yet.
 
     Args:
-        run, walk: of its track. sample_id: unique among the samples of all runs; "": that of the caption.
+        run: of its track. sample_id: unique among the samples of all runs; "": that of the caption.
     """
     values = (caption.checks.values or {}).get(language)
     if caption.status != "accepted":
@@ -177,7 +176,7 @@ def make_sample(
         language=language,
         run=run,
         window_id=caption.sample_id,
-        walk=walk,
+        walk="",
         window=tuple(caption.window),
         views=pictures.views,
         picture_px=pictures.size_px,
@@ -197,27 +196,20 @@ class _Window(NamedTuple):
     samples: list[Sample]
     reasons: list[str]
 
-    def rank(self, seed: int) -> int:
-        """Return a random number of a window with samples, which does not depend on the other windows."""
-        return int.from_bytes(hashlib.sha256(f"{seed}/{STAGE}/{self.samples[0].sample_id}".encode()).digest()[:8])
 
-
-class _Windows:
-    """The windows of all sources; can be iterated repeatedly.
-
-    courses: of the tracks that were read. walks: key of a track -> its walk, set after the first iteration.
-    """
+class _Tracks:
+    """The tracks of all sources. courses: of those that were read."""
 
     def __init__(self, cfg: PrepareConfig, sources: Sequence[RunSource]) -> None:
         self._cfg, self._sources = cfg, sources
         self._frames: dict[Path, frozenset[int]] = {}  # of a track: those that have all files of the views
         self.courses: list[Course] = []
-        self.walks: Mapping[str, str] = {}
         self._read = lru_cache(maxsize=4)(lambda folder: read_track(folder, strict=False))
         trees = [(source.run, source.data) for source in sources] if len(sources) > 1 else []
         self._ids = flight_ids([track_place(folder, run) for run, tree in trees for folder in find_tracks(tree)])
 
-    def __iter__(self) -> Iterator[_Window]:
+    def windows(self) -> Iterator[_Window]:
+        """Yield the windows of all captions."""
         for source in self._sources:
             for caption in read_captions(source.captions):
                 place = TrackPlace(source.run, caption.town, caption.trajectory, caption.variant)
@@ -235,8 +227,7 @@ class _Windows:
         if folder not in self._frames:
             self._frames[folder] = self._frames_of(folder, key, place.town)
         name = sample_id(self._ids[place], caption.frame_index) if place in self._ids else caption.sample_id
-        own = {"run": source.run, "walk": self.walks.get(key, ""), "sample_id": name}
-        sample = make_sample(caption, language, self._cfg, **own)
+        sample = make_sample(caption, language, self._cfg, run=source.run, sample_id=name)
         if isinstance(sample, str):
             return sample
         if not self._frames[folder].issuperset(sample.window):
@@ -286,60 +277,42 @@ def run(
         record = record_of(source.captions)
         if record is None or "data" not in record.inputs:
             log.warning("%s: no record tells that these are captions of %s", source.captions, source.data)
-    windows = _Windows(cfg, sources)
-    # Two passes: the splits and the selection must be known before the first sample is written.
-    ranks, keys, left_out = _survey(windows, seed)
-    if not ranks:
+    tracks, windows, left_out = _Tracks(cfg, sources), dict[str, _Window](), Counter[str]()
+    with progress_bar(f"{STAGE}: reading", total=None) as advance:
+        for window in tracks.windows():
+            advance(1)
+            left_out.update(window.reasons)
+            if window.samples and windows.setdefault(window.samples[0].sample_id, window) is not window:
+                where, fix = window.samples[0].sample_id, "remove one of the two lines from the captions"
+                raise InputError("two captions are of the same window", where=where, fix=fix)
+    if not windows:
         tally = Tally(input=left_out.total(), dropped=left_out)
         raise stage.nothing_kept(tally, expected="accepted captions with images below --data")
-    windows.walks = walks_of(windows.courses)
-    split_of = cfg.assigned(keys, windows.walks, seed)
-    last_rank = sorted(ranks)[cfg.limit - 1] if 0 < cfg.limit < len(ranks) else max(ranks)
+    walks = walks_of(tracks.courses)
+    split_of = cfg.assigned({window.key for window in windows.values()}, walks, seed)
+    # At random, and independent of the other windows.
+    ranked = sorted(windows, key=lambda name: hashlib.sha256(f"{seed}/{STAGE}/{name}".encode()).digest())
+    chosen = set(ranked[: cfg.limit or None])
     decisions: dict[Split, Counter[str]] = {split: Counter() for split in SPLITS}
-    tracks: dict[Split, set[tuple[str, ...]]] = {split: set() for split in SPLITS}
-    with (
-        SplitWriter(out, Sample).writing() as writer,
-        progress_bar(f"{STAGE}: writing", total=None) as advance,
-    ):
-        for window in windows:
-            advance(1)
-            if window.samples and window.rank(seed) > last_rank:
+    flights: dict[Split, set[tuple[str, ...]]] = {split: set() for split in SPLITS}
+    with SplitWriter(out, Sample).writing() as writer:
+        for name, window in windows.items():
+            if name not in chosen:
                 left_out["limit"] += len(window.samples)
                 continue
+            split, walk = split_of[window.key], walks[window.key]
             for sample in window.samples:
-                split = split_of[window.key]
                 decisions[split][sample.decision] += 1
-                tracks[split].add((sample.walk, window.key, sample.variant))
-                writer.add(split, sample)
+                flights[split].add((walk, window.key, sample.variant))
+                writer.add(split, sample.model_copy(update={"walk": walk}))
     pictured = sources if cfg.modalities else []
     trees = [SourceTree(run=source.run, sha256=fingerprint(source.data)) for source in pictured]
     write_model(out / RECORD, TrainingSet(split_by=cfg.split_by, trees=trees, samples=writer.counts), RECORD_FORMAT)
     page = write_page(out, "Training set", writer.counts, trees, PAGE_TEXT.format(cfg.split_by))
     num_kept = sum(writer.counts.values())
     tally = Tally(input=num_kept + left_out.total(), kept=num_kept, dropped=left_out)
-    stage.finish([*writer.paths, out / RECORD, page], tally, splits=_facts(decisions, tracks), split_by=cfg.split_by)
+    stage.finish([*writer.paths, out / RECORD, page], tally, splits=_facts(decisions, flights), split_by=cfg.split_by)
     return out
-
-
-def _survey(windows: _Windows, seed: int) -> tuple[set[int], set[str], Counter[str]]:
-    """Return the ranks of the usable windows, the keys of their tracks, and the reasons for missing samples.
-
-    Raises:
-        InputError: two captions are of one window.
-    """
-    ranks, keys, reasons = set[int](), set[str](), Counter[str]()
-    with progress_bar(f"{STAGE}: reading", total=None) as advance:
-        for window in windows:
-            advance(1)
-            reasons.update(window.reasons)
-            if window.samples:
-                rank = window.rank(seed)
-                if rank in ranks:
-                    where, fix = window.samples[0].sample_id, "remove one of the two lines from the captions"
-                    raise InputError("two captions are of the same window", where=where, fix=fix)
-                ranks.add(rank)
-                keys.add(window.key)
-    return ranks, keys, reasons
 
 
 def _facts(

@@ -27,7 +27,6 @@ log = logging.getLogger(__name__)
 MOST_WORKERS = 16
 SAMPLES_PER_WORKER = 64  # for fewer, another worker process is not worth its start
 FEATURES_SHARE = 0.5  # of the memory of a machine: for the features of pictures in all of its processes
-TOO_LONG, SPECIAL_TOKEN, UNREADABLE = "too_long", "special_token", "unreadable_picture"
 
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
@@ -56,10 +55,6 @@ def _start_worker(parent_pid: int, _: int) -> None:
     cv2.setNumThreads(0)
 
 
-def _unchanged(value: Any) -> Any:
-    return value
-
-
 def in_order(function: Callable[[ItemT], ResultT], items: Sequence[ItemT], wanted: int) -> Iterator[ResultT]:
     """Yield function(item) for each item, in order, computed ahead by worker processes.
 
@@ -78,7 +73,7 @@ def in_order(function: Callable[[ItemT], ResultT], items: Sequence[ItemT], wante
         num_workers=workers,
         worker_init_fn=partial(_start_worker, os.getpid()),
         multiprocessing_context="fork" if workers else None,
-        collate_fn=_unchanged,
+        collate_fn=lambda result: result,
     )
     for result in loader:
         if isinstance(result, CosflyError):
@@ -125,10 +120,10 @@ class TrainingSplit:
         """Return a sample as tokens, or why it is skipped."""
         sample = self.samples[place]
         if token := special_token_in(self.processor, sample):
-            return SPECIAL_TOKEN, f"{sample.key}: a text contains {token}"
+            return "special_token", f"{sample.key}: a text contains {token}"
         row = self.processor.encode(sample, self.max_pixels, self.weights)
         if len(row) > max_tokens:
-            return TOO_LONG, f"{sample.key}: {len(row)} tokens"
+            return "too_long", f"{sample.key}: {len(row)} tokens"
         return TrainingSample(place, row, tuple(pictures_of(sample)))
 
     def skip_unreadable(self, unreadable: Mapping[FramePicture, str]) -> None:
@@ -139,7 +134,7 @@ class TrainingSplit:
             if words is None:
                 self.used.append(sample)
             else:
-                self.skipped[UNREADABLE].append(words)
+                self.skipped["unreadable_picture"].append(words)
 
     @property
     def lengths(self) -> np.ndarray:

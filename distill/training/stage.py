@@ -229,7 +229,10 @@ def run(
             given: Any = {"config": cfg, "inputs": inputs, "seed": seed, "resume": resume}
             folder = StageFolder.open(out, STAGE, **given, begun=(LOG, STUDENT))
             if random_student and not folder.is_complete and not base.exists():
-                make_random_student(base, random_student, seed, _texts(open_split(dataset, "train")))
+                samples = open_split(dataset, "train")
+                chosen = samples[:: max(1, len(samples) // TOKENIZER_SAMPLES)]
+                texts = (text for s in chosen for text in (s.prompt.system, s.prompt.user, s.answer))
+                make_random_student(base, random_student, seed, texts)
         if broadcast_object_list([folder is not None and folder.is_complete])[0]:
             return product
         accelerator.init_trackers(STAGE)
@@ -258,13 +261,6 @@ def run(
     return product
 
 
-def _texts(samples: Sequence[Sample]) -> Iterator[str]:
-    """Yield the texts that the tokenizer of a random student is trained on."""
-    for number in range(0, len(samples), max(1, len(samples) // TOKENIZER_SAMPLES)):
-        sample = samples[number]
-        yield from (sample.prompt.system, sample.prompt.user, sample.answer)
-
-
 def _context(
     cfg: TrainConfig, dataset: Path, trees: dict[str, Path], base: Path, seed: int, accelerator: Any
 ) -> tuple[TrainingContext, ChatFormat]:
@@ -274,7 +270,7 @@ def _context(
     if not samples:
         fix = "prepare the training set with more captions, or with other fractions"
         raise InputError("the training split is empty", where=dataset, fix=fix)
-    if not student.has_pictures and open_split(dataset, "train")[0].views:
+    if trees and not student.has_pictures:
         log.warning("%s: the student takes no pictures: it is taught with the text state alone", STAGE)
     check_template(student, samples[0])
     check_head(student)
