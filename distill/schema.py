@@ -8,9 +8,10 @@ README.md                                  for `datasets.load_dataset`
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
-from typing import Any, Literal, Self, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -164,46 +165,28 @@ def open_split(dataset: Path, split: Split, *, text_only: bool = False) -> list[
     return [sample.without_pictures() if text_only else sample for sample in samples]
 
 
-class SplitWriter:
-    """Writes records to one parquet file per split; at most a row group of each split waits in memory.
+def write_splits(
+    out: Path, model: type[SplitMember], records: Mapping[Split, Iterable[SplitMember]]
+) -> tuple[dict[Split, int], list[Path]]:
+    """Write records to one parquet file per split, which appears when it is complete.
 
-    counts: records of each split.
+    Returns:
+        The number of records of each split, and the files.
     """
-
-    def __init__(self, out: Path, model: type[SplitMember]) -> None:
-        self._out, self._columns, self._stack = out, columns_of(model), contextlib.ExitStack()
-        self.counts: dict[Split, int] = dict.fromkeys(SPLITS, 0)
-        self._rows: dict[Split, list[dict[str, Any]]] = {split: [] for split in SPLITS}
-        self._writers: dict[Split, pq.ParquetWriter] = {}
-
-    @property
-    def paths(self) -> list[Path]:
-        """Files written."""
-        return [split_path(self._out, split) for split, count in self.counts.items() if count]
-
-    def add(self, split: Split, record: SplitMember) -> None:
-        self.counts[split] += 1
-        self._rows[split].append(record.model_dump(mode="json"))
-        if len(self._rows[split]) == ROWS_AT_ONCE:
-            self._write(split)
-
-    @contextlib.contextmanager
-    def writing(self) -> Iterator[Self]:
-        """Hold the files open; they appear when the block ends without an error."""
-        with self._stack:
-            yield self
-            for split in SPLITS:
-                self._write(split)
-
-    def _write(self, split: Split) -> None:
-        rows, self._rows[split] = self._rows[split], []
-        if rows and split not in self._writers:
-            # Statistics of whole prompts would make the footer large.
-            file = self._stack.enter_context(atomic_file(split_path(self._out, split)))
-            writer = pq.ParquetWriter(file, self._columns, compression="zstd", write_statistics=False)
-            self._writers[split] = self._stack.enter_context(writer)
-        if rows:
-            self._writers[split].write_table(pa.Table.from_pylist(rows, schema=self._columns))
+    columns, counts = columns_of(model), dict[Split, int]()
+    for split, own in records.items():
+        counts[split], rows = 0, (record.model_dump(mode="json") for record in own)
+        with contextlib.ExitStack() as stack:
+            writer: pq.ParquetWriter | None = None
+            while part := list(islice(rows, ROWS_AT_ONCE)):
+                if writer is None:
+                    file = stack.enter_context(atomic_file(split_path(out, split)))
+                    # Statistics of whole prompts would make the footer large.
+                    settings: Any = {"compression": "zstd", "write_statistics": False}
+                    writer = stack.enter_context(pq.ParquetWriter(file, columns, **settings))
+                writer.write_table(pa.Table.from_pylist(part, schema=columns))
+                counts[split] += len(part)
+    return counts, [split_path(out, split) for split, count in counts.items() if count]
 
 
 def write_page(out: Path, title: str, samples: Mapping[Split, int], trees: Sequence[SourceTree], text: str) -> Path:

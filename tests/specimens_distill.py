@@ -14,7 +14,7 @@ from cosfly.runtime.json_io import write_model
 from cosfly.runtime.run_dir import fingerprint
 from distill.prepare import stage as prepare
 from distill.prepare.stage import PrepareConfig, RunSource
-from distill.schema import RECORD, RECORD_FORMAT, Sample, SourceTree, SplitWriter, TrainingSet
+from distill.schema import RECORD, RECORD_FORMAT, Sample, SourceTree, TrainingSet, write_splits
 
 WINDOW = 5
 DECISIONS = ("track_straight", "yaw_left_to_follow", "track_straight", "slow_down")
@@ -65,12 +65,9 @@ def prepared(tree: Path, captions: Path, out: Path, *, seed: int = 0, **settings
 def write_set(out: Path, splits: Mapping[Split, Iterable[Sample]], trees: Iterable[Path] = ()) -> Path:
     """Write a training set of given samples; the trees are of the run that each stands in."""
     out.mkdir(parents=True, exist_ok=True)
-    with SplitWriter(out, Sample).writing() as writer:
-        for split, samples in splits.items():
-            for sample in samples:
-                writer.add(split, sample)
+    counts, _ = write_splits(out, Sample, splits)
     sources = [SourceTree(run=tree.parent.name, sha256=fingerprint(tree)) for tree in trees]
-    write_model(out / RECORD, TrainingSet(split_by="walk", trees=sources, samples=writer.counts), RECORD_FORMAT)
+    write_model(out / RECORD, TrainingSet(split_by="walk", trees=sources, samples=counts), RECORD_FORMAT)
     return out
 
 

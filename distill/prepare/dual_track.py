@@ -5,7 +5,7 @@ Needs neither captions nor torch.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from pydantic import Field
 
 from cosfly.formats.places import Place, flight_ids, place_of, sample_id
 from cosfly.formats.playback import ORIGINAL, Track, read_track
-from cosfly.formats.predictions import Split
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.geometry.axes import step_s
 from cosfly.geometry.splits import SPLITS, Course, walks_of
@@ -23,7 +22,7 @@ from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, fingerprint, write_failures
 from distill.prepare.stage import SplitConfig, check_names, run_of
-from distill.schema import SourceTree, SplitMember, SplitWriter, tree_inputs, write_page
+from distill.schema import SourceTree, SplitMember, tree_inputs, write_page, write_splits
 
 STAGE = "distill.dual_track"
 STEP_TOLERANCE_S = 1e-3
@@ -84,61 +83,48 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=tree_inputs(runs.values()), seed=seed, resume=resume)
     if stage.is_complete:
         return out
-    # Two passes: the splits must be known before the first window is written.
     folders = {place_of(folder, run): folder for run, tree in runs.items() for folder in find_tracks(tree)}
-    ids = flight_ids(folders)
-    courses, tally = _survey(stage, cfg, folders)
-    walks = walks_of(courses.values())
-    split_of = cfg.assigned({course.name for course in courses.values()}, walks, seed)
-    tracks: dict[Split, list[str]] = {split: [] for split in SPLITS}
-    num_windows = 0
-    with SplitWriter(out, TrackSample).writing() as writer, progress_bar(f"{STAGE}: writing", len(courses)) as advance:
-        for place, course in courses.items():
-            advance(1)
-            pair = _read_pair(folders[place], cfg)
-            assert isinstance(pair, tuple), "the track was changed while it was read"
-            walk, split = walks[course.name], split_of[course.name]
-            tracks[split].append(walk)
-            num_windows += len(windows_of(len(pair[0]), cfg))
-            for sample in samples_of(place, ids[place], *pair, walk, cfg):
-                writer.add(split, sample)
-    sources = [SourceTree(run=name, sha256=fingerprint(tree)) for name, tree in runs.items()]
-    page = write_page(out, "Windows over two tracks", writer.counts, sources, PAGE_TEXT.format(cfg=cfg))
-    facts = {
-        split: {"samples": writer.counts[split], "tracks": len(found), "walks": len(set(found))}
-        for split, found in tracks.items()
-    }
-    num_uneven = num_windows - sum(writer.counts.values())
-    stage.finish([*writer.paths, page], tally, splits=facts, windows_left_out={"uneven_steps": num_uneven})
-    return out
-
-
-def _survey(
-    stage: StageFolder, cfg: DualTrackConfig, folders: Mapping[Place, Path]
-) -> tuple[dict[Place, Course], Tally]:
-    """Return the courses of the perturbed tracks that give windows, and the counts of all tracks."""
-    courses: dict[Place, Course] = {}
+    ids, pairs = flight_ids(folders), dict[Place, tuple[Track, Track]]()
     tally, failures = Tally(), list[Failed]()
     with progress_bar(f"{STAGE}: reading", total=len(folders)) as advance:
         for place, folder in folders.items():
             advance(1)
-            key = f"{place.run}/{place.town}/{place.trajectory}"
             try:
                 pair = None if folder.name == ORIGINAL else _read_pair(folder, cfg)
             except InputError as error:
-                failures.append(Failed(id=f"{key}/{place.variant}", code=error.code, message=str(error)))
+                failures.append(Failed(id=f"{_key(place)}/{place.variant}", code=error.code, message=str(error)))
                 tally.count(failures[-1])
                 continue
             if isinstance(pair, str):
                 tally.dropped[pair] += 1
             elif pair is not None:
-                courses[place] = Course(key, place.town, pair[1].time_s, pair[1].walked_m).at_seconds()
-    write_failures(stage.path / "failures.jsonl", failures)
-    tally.kept = len(courses)
+                pairs[place] = pair
+    write_failures(out / "failures.jsonl", failures)
+    tally.kept = len(pairs)
     tally.input = tally.kept + tally.dropped.total() + len(failures)
-    if not courses:
+    if not pairs:
         raise stage.nothing_kept(tally, expected=f"a perturbed track of {cfg.length} frames with its clean track")
-    return courses, tally
+    walks = walks_of(Course(_key(at), at.town, twin.time_s, twin.walked_m) for at, (_, twin) in pairs.items())
+    split_of = cfg.assigned(walks, walks, seed)
+    tracks = {split: [place for place in pairs if split_of[_key(place)] == split] for split in SPLITS}
+    samples = {
+        split: (s for at in own for s in samples_of(at, ids[at], *pairs[at], walks[_key(at)], cfg))
+        for split, own in tracks.items()
+    }
+    counts, paths = write_splits(out, TrackSample, samples)
+    sources = [SourceTree(run=name, sha256=fingerprint(tree)) for name, tree in runs.items()]
+    page = write_page(out, "Windows over two tracks", counts, sources, PAGE_TEXT.format(cfg=cfg))
+    facts = {
+        split: {"samples": counts[split], "tracks": len(own), "walks": len({walks[_key(place)] for place in own})}
+        for split, own in tracks.items()
+    }
+    num_uneven = sum(len(windows_of(len(track), cfg)) for track, _ in pairs.values()) - sum(counts.values())
+    stage.finish([*paths, page], tally, splits=facts, windows_left_out={"uneven_steps": num_uneven})
+    return out
+
+
+def _key(place: Place) -> str:
+    return f"{place.run}/{place.town}/{place.trajectory}"
 
 
 def _read_pair(folder: Path, cfg: DualTrackConfig) -> tuple[Track, Track] | str | None:

@@ -35,7 +35,7 @@ from cosfly.runtime.io import check_stays_below, inside
 from cosfly.runtime.json_io import dump_json, write_model
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally, fingerprint, record_of
 from cosfly.viz.frame_views import DEPTH_RANGE_M, VIEW_FILES, Pictures, View, scaled_size
-from distill.schema import RECORD, RECORD_FORMAT, Sample, SourceTree, SplitWriter, TrainingSet, tree_inputs, write_page
+from distill.schema import RECORD, RECORD_FORMAT, Sample, SourceTree, TrainingSet, tree_inputs, write_page, write_splits
 
 log = logging.getLogger(__name__)
 
@@ -293,39 +293,35 @@ def run(
     # At random, and independent of the other windows.
     ranked = sorted(windows, key=lambda name: hashlib.sha256(f"{seed}/{STAGE}/{name}".encode()).digest())
     chosen = set(ranked[: cfg.limit or None])
-    decisions: dict[Split, Counter[str]] = {split: Counter() for split in SPLITS}
-    flights: dict[Split, set[tuple[str, ...]]] = {split: set() for split in SPLITS}
-    with SplitWriter(out, Sample).writing() as writer:
-        for name, window in windows.items():
-            if name not in chosen:
-                left_out["limit"] += len(window.samples)
-                continue
-            split, walk = split_of[window.key], walks[window.key]
-            for sample in window.samples:
-                decisions[split][sample.decision] += 1
-                flights[split].add((walk, window.key, sample.variant))
-                writer.add(split, sample.model_copy(update={"walk": walk}))
+    samples: dict[Split, list[Sample]] = {split: [] for split in SPLITS}
+    for name, window in windows.items():
+        if name in chosen:
+            update = {"walk": walks[window.key]}
+            samples[split_of[window.key]] += [sample.model_copy(update=update) for sample in window.samples]
+        else:
+            left_out["limit"] += len(window.samples)
+    counts, paths = write_splits(out, Sample, samples)
     pictured = sources if cfg.modalities else []
     trees = [SourceTree(run=source.run, sha256=fingerprint(source.data)) for source in pictured]
-    write_model(out / RECORD, TrainingSet(split_by=cfg.split_by, trees=trees, samples=writer.counts), RECORD_FORMAT)
-    page = write_page(out, "Training set", writer.counts, trees, PAGE_TEXT.format(cfg.split_by))
-    num_kept = sum(writer.counts.values())
+    write_model(out / RECORD, TrainingSet(split_by=cfg.split_by, trees=trees, samples=counts), RECORD_FORMAT)
+    page = write_page(out, "Training set", counts, trees, PAGE_TEXT.format(cfg.split_by))
+    num_kept = sum(counts.values())
     tally = Tally(input=num_kept + left_out.total(), kept=num_kept, dropped=left_out)
-    stage.finish([*writer.paths, out / RECORD, page], tally, splits=_facts(decisions, flights), split_by=cfg.split_by)
+    stage.finish([*paths, out / RECORD, page], tally, splits=_facts(samples), split_by=cfg.split_by)
     return out
 
 
-def _facts(
-    decisions: Mapping[Split, Counter[str]], tracks: Mapping[Split, set[tuple[str, ...]]]
-) -> dict[str, dict[str, Any]]:
+def _facts(samples: Mapping[Split, Sequence[Sample]]) -> dict[str, dict[str, Any]]:
     """Return the counts of the manifest; warn of empty splits and of decisions that training does not have."""
     facts: dict[str, dict[str, Any]] = {}
-    for split, own in decisions.items():
+    known = {sample.decision for sample in samples["train"]}
+    for split, own in samples.items():
+        decisions = dict(sorted(Counter(sample.decision for sample in own).items()))
         if not own:
             log.warning("%s: the split %s is empty", STAGE, split)
-        if unseen := {name: count for name, count in own.items() if name not in decisions["train"]}:
+        if unseen := {name: count for name, count in decisions.items() if name not in known}:
             log.warning("%s: %s has decisions that train does not have: %s", STAGE, split, unseen)
-        counts = {"samples": own.total(), "walks": len({walk for walk, *_ in tracks[split]})}
-        counts["tracks"] = len(tracks[split])
-        facts[split] = {**counts, "by_decision": dict(sorted(own.items())), "not_in_train": unseen}
+        tracks = {(sample.run, sample.town, sample.trajectory, sample.variant) for sample in own}
+        counts = {"samples": len(own), "walks": len({sample.walk for sample in own}), "tracks": len(tracks)}
+        facts[split] = {**counts, "by_decision": decisions, "not_in_train": unseen}
     return facts
