@@ -8,7 +8,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import AsyncGenerator, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -32,7 +32,7 @@ from cosfly.llm.vllm_engine import VllmConfig, VllmEngine
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.console import Advance, progress_bar
 from cosfly.runtime.errors import ConfigError, InputError, TeacherError
-from cosfly.runtime.io import atomic_file, inside, sha256_bytes
+from cosfly.runtime.io import inside, sha256_bytes, write_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.model_json import CONTEXT_FULL
 from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, read_manifest, read_stage_record, write_failures
@@ -111,6 +111,16 @@ class SampleOutcome:
         """Return the outcome of a sample that got no answer."""
         return cls(sample, Failed(id=sample.key, code=code, message=str(error)))
 
+    def prediction(self, split: Split, model: str) -> Prediction:
+        """Return the record of the sample."""
+        if isinstance(self.found, Failed):
+            record = failed_prediction(self.sample, split, self.found.code)
+        else:
+            is_finished = self.found.finish_reason not in ("length", CONTEXT_FULL)
+            num_tokens = self.found.usage.get("completion_tokens", 0)
+            record = make_prediction(self.sample, split, self.found.text, num_tokens, is_finished)
+        return record.model_copy(update={"model": model})
+
 
 def make_prediction(sample: Sample, split: Split, text: str, num_tokens: int, is_finished: bool) -> Prediction:
     """Parse an answer and return its record."""
@@ -125,32 +135,6 @@ def make_prediction(sample: Sample, split: Split, text: str, num_tokens: int, is
 def failed_prediction(sample: Sample, split: Split, code: str) -> Prediction:
     """Return the record of a sample without an answer: empty, with a reason that counts as no wrong answer."""
     return make_prediction(sample, split, "", 0, False).model_copy(update={"reason": f"{FAILED}{code}"})
-
-
-@dataclass
-class Results:
-    """Counts of the outcomes of a run. new: answers of this run and their tokens."""
-
-    tally: Tally = field(default_factory=Tally)
-    failures: list[Failed] = field(default_factory=list)
-    num_parsed: int = 0
-    new: Counter[str] = field(default_factory=Counter)
-
-    def add(self, outcome: SampleOutcome, split: Split) -> Prediction:
-        """Count an outcome and return its record."""
-        sample, found = outcome.sample, outcome.found
-        self.tally.input += 1
-        if isinstance(found, Failed):
-            self.tally.count(found)
-            self.failures.append(found)
-            return failed_prediction(sample, split, found.code)
-        self.tally.kept += 1
-        if outcome.is_new:
-            self.new.update(found.usage, answers=1)
-        is_finished = found.finish_reason not in ("length", CONTEXT_FULL)
-        prediction = make_prediction(sample, split, found.text, found.usage.get("completion_tokens", 0), is_finished)
-        self.num_parsed += prediction.coc is not None
-        return prediction
 
 
 # --- students in this process, and engines ----------------------------------------------------------------------------
@@ -381,19 +365,27 @@ def run(
     given = Inputs(samples, trees, model, adapter)
     start_s = time.monotonic()
     name = str(cfg.endpoint.model) if cfg.engine == "endpoint" else given.name
-    results = asyncio.run(_answer_all(cfg, given, out, name))
-    speed = {"seconds": round(time.monotonic() - start_s, 3), **results.new}
+    outcomes, new = asyncio.run(_answer_all(cfg, given, out))
+    speed = {"seconds": round(time.monotonic() - start_s, 3), **new}
+    predictions = [outcome.prediction(cfg.split, name) for outcome in outcomes]
+    lines = (dump_json(prediction.model_dump(mode="json")) + "\n" for prediction in predictions)
+    write_bytes(out / PREDICTIONS, "".join(lines).encode())
+    failures = [outcome.found for outcome in outcomes if isinstance(outcome.found, Failed)]
+    write_failures(out / "failures.jsonl", failures)
+    failed = Counter(failure.code for failure in failures)
+    tally = Tally(input=len(outcomes), kept=len(outcomes) - len(failures), failed=failed)
+    num_parsed = sum(prediction.coc is not None for prediction in predictions)
+    facts = {"split": cfg.split, "has_adapter": adapter is not None, "model": name, "parsed": num_parsed}
     outputs = [out / PREDICTIONS, *sorted((out / ANSWERS).glob("*.jsonl"))]
-    facts = {"split": cfg.split, "has_adapter": adapter is not None, "model": name, "parsed": results.num_parsed}
-    stage.finish(outputs, results.tally, **facts, speed=speed)
+    stage.finish(outputs, tally, **facts, speed=speed)
     return out / PREDICTIONS
 
 
-async def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path, model: str) -> Results:
-    """Answer all samples, and write a record of each and the failures."""
-    results = Results()
+async def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path) -> tuple[list[SampleOutcome], Counter[str]]:
+    """Answer all samples; return their outcomes, and the numbers of answers and tokens of this run."""
     async with contextlib.AsyncExitStack() as stack:
         book = stack.enter_context(AnswerBook(out / ANSWERS))
+        before = book.totals.copy()
         advance = stack.enter_context(progress_bar(STAGE, total=len(inputs.samples)))
         answering: LocalAnswers | EngineAnswers
         if cfg.engine == "transformers":
@@ -407,10 +399,5 @@ async def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path, model: str) -
                 engine = VllmEngine(Path(inputs.model), cfg.vllm, cfg.sampling, num_images=most, settings=STAGE)
             await stack.enter_async_context(started(engine))
             answering = EngineAnswers(engine, book, inputs, cfg)
-        outcomes = await stack.enter_async_context(contextlib.aclosing(answering.answers(inputs.samples, advance)))
-        with atomic_file(out / PREDICTIONS) as file:
-            async for outcome in outcomes:
-                prediction = results.add(outcome, cfg.split).model_copy(update={"model": model})
-                file.write((dump_json(prediction.model_dump(mode="json")) + "\n").encode())
-    write_failures(out / "failures.jsonl", results.failures)
-    return results
+        outcomes = [outcome async for outcome in answering.answers(inputs.samples, advance)]
+        return outcomes, book.totals - before
