@@ -263,26 +263,21 @@ def padded(processor: Processor, rows: Sequence[EncodedSample]) -> dict[str, np.
 
     Causal attention never sees what is on the right, so no mask is needed.
     """
-    found = {
-        "input_ids": _stacked([np.append(r.prompt_ids, r.answer_ids) for r in rows], processor.pad_token_id),
-        "labels": _stacked([np.append(np.full_like(r.prompt_ids, IGNORED), r.answer_ids) for r in rows], IGNORED),
-        "weights": _stacked([np.append(np.zeros(len(r.prompt_ids), np.float32), r.weights) for r in rows], 0),
-    }
-    if any(row.kinds.any() for row in rows):
-        found[processor.kinds_name] = _stacked([np.append(r.kinds, np.zeros_like(r.answer_ids)) for r in rows], 0)
-    return found
+    ids = _stacked([np.append(row.prompt_ids, row.answer_ids) for row in rows], processor.pad_token_id)
+    labels = [np.append(np.full_like(row.prompt_ids, IGNORED), row.answer_ids) for row in rows]
+    weights = [np.append(np.zeros(len(row.prompt_ids), np.float32), row.weights) for row in rows]
+    found = {"input_ids": ids, "labels": _stacked(labels, IGNORED), "weights": _stacked(weights, 0)}
+    kinds = [np.append(row.kinds, np.zeros_like(row.answer_ids)) for row in rows]
+    return found | ({processor.kinds_name: _stacked(kinds, 0)} if any(map(np.any, kinds)) else {})
 
 
 def prompt_batch(processor: Processor, rows: Sequence[EncodedSample]) -> dict[str, np.ndarray]:
     """Pad prompts on the left, (b, n), so that all continue at the same place: the model's inputs without pictures."""
-    ids = [row.prompt_ids for row in rows]
-    found = {
-        "input_ids": _stacked(ids, processor.pad_token_id, is_left=True),
-        "attention_mask": _stacked([np.ones_like(row) for row in ids], 0, is_left=True),
-    }
-    if any(row.kinds.any() for row in rows):
-        found[processor.kinds_name] = _stacked([row.kinds for row in rows], 0, is_left=True)
-    return found
+    ids = _stacked([row.prompt_ids for row in rows], processor.pad_token_id, is_left=True)
+    mask = _stacked([np.ones_like(row.prompt_ids) for row in rows], 0, is_left=True)
+    kinds = _stacked([row.kinds for row in rows], 0, is_left=True)
+    found = {"input_ids": ids, "attention_mask": mask}
+    return found | ({processor.kinds_name: kinds} if kinds.any() else {})
 
 
 def _stacked(rows: Sequence[np.ndarray], fill: int, *, is_left: bool = False) -> np.ndarray:

@@ -9,7 +9,7 @@ import contextlib
 import functools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 from cosfly.llm.student_chat import limited_picture
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import inside
-from cosfly.viz.frame_views import Pictures, View
+from cosfly.viz.frame_views import Pictures
 from distill.schema import Sample
 from distill.student.chat import Processor
 from distill.student.model import Student
 
-ENCODED_TOGETHER, READ_TOGETHER = 16, 64  # pictures
+TOGETHER = 16  # pictures that are read, and then encoded together
 # Tensors of one picture by name. Before encoding: the inputs of the model. After it: `pooled`, (tokens, width) or as
 # the family shapes it; `deep.00`, ... for deeper layers of the language model; both with LISTED at the end of the name
 # where the family returns a list with one entry per picture; and the inputs without pixels, such as `image_grid_thw`.
@@ -36,20 +36,15 @@ class FramePicture(NamedTuple):
 
     run: str
     frame: str
-    view: View
-    size_px: tuple[int, int]
-    depth_range_m: float
+    picture: Pictures
     is_alone: bool = False  # the only picture of its sample, which some families encode in more detail
 
 
 def pictures_of(sample: Sample) -> list[FramePicture]:
     """Return the pictures of a sample in the order of its prompt."""
-    is_alone = len(sample.frames) * len(sample.views) == 1
-    return [
-        FramePicture(sample.run, frame, view, sample.picture_px, sample.depth_range_m, is_alone)
-        for frame in sample.frames
-        for view in sample.views
-    ]
+    views = [replace(sample.pictures, views=(view,)) for view in sample.views]
+    is_alone = len(sample.frames) * len(views) == 1
+    return [FramePicture(sample.run, frame, view, is_alone) for frame in sample.frames for view in views]
 
 
 @dataclass(frozen=True)
@@ -72,8 +67,7 @@ class PictureReader:
         """
         import torch
 
-        view = Pictures((picture.view,), picture.size_px, "separate", picture.depth_range_m)
-        (pixels,) = view.read(inside(self.trees[picture.run], picture.frame))
+        (pixels,) = picture.picture.read(inside(self.trees[picture.run], picture.frame))
         found = self.processor.picture_inputs(limited_picture(pixels, self.max_pixels), is_alone=picture.is_alone)
         tensors = {name: torch.from_numpy(array) for name, array in found.items()}
         return {name: t.to(self.dtype) if t.is_floating_point() else t for name, t in tensors.items()}
@@ -90,12 +84,11 @@ def encode(student: Student, pictures: Sequence[Tensors]) -> list[Tensors]:
     """Encode pictures, those of equal shapes together; on a CPU one at a time, so that results never differ."""
     groups: dict[Any, list[int]] = {}
     for i, picture in enumerate(pictures):
-        groups.setdefault(tuple((name, tuple(t.shape)) for name, t in picture.items()), []).append(i)
-    size, found = 1 if student.device == "cpu" else ENCODED_TOGETHER, dict[int, Tensors]()
+        shapes = tuple((name, tuple(tensor.shape)) for name, tensor in picture.items())
+        groups.setdefault(i if student.device == "cpu" else shapes, []).append(i)
+    found: dict[int, Tensors] = {}
     for group in groups.values():
-        for start in range(0, len(group), size):
-            part = group[start : start + size]
-            found |= dict(zip(part, _encode_together(student, [pictures[i] for i in part]), strict=True))
+        found |= dict(zip(group, _encode_together(student, [pictures[i] for i in group]), strict=True))
     return [found[i] for i in range(len(pictures))]
 
 
@@ -118,7 +111,7 @@ def read_features(
     found: dict[FramePicture, Tensors | str] = {}
     num_bytes = 0
     results = zip(pictures, read, strict=True)
-    while part := dict(islice(results, READ_TOGETHER)):
+    while part := dict(islice(results, TOGETHER)):
         found |= {picture: words for picture, words in part.items() if isinstance(words, str)}
         good = {picture: tensors for picture, tensors in part.items() if not isinstance(tensors, str)}
         if num_bytes >= most_bytes:

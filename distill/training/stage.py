@@ -10,13 +10,12 @@ import logging
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from datetime import timedelta
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from cosfly.formats.captions import Language, Place, Prompt
 from cosfly.formats.predictions import Split
 from cosfly.llm.student_chat import ChatFormat, FrameFormat, write_chat_format
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
@@ -43,27 +42,24 @@ TOKENIZER_SAMPLES = 2000  # most samples that the tokenizer of a random student 
 PATIENCE = timedelta(minutes=30)  # for the slowest process: loading weights, counting tokens, validation
 
 
-def taught_by(samples: Iterable[Sample], max_pixels: int) -> ChatFormat:
+def taught_by(samples: Sequence[Sample], max_pixels: int) -> ChatFormat:
     """Return the chat format of a training.
 
     Args:
         max_pixels: limit of a picture; 0: none.
     """
-    prompts: dict[Language, Prompt] = {}
-    looks: set[FrameFormat] = set()
-    lengths: set[int] = set()
-    decision: Place = "last"
-    for sample in samples:
-        prompts.setdefault(sample.language, sample.prompt)
-        looks.add(FrameFormat(views=sample.views, size_px=sample.picture_px, depth_range_m=sample.depth_range_m))
-        lengths.add(len(sample.frames))
-        decision = decision_place(sample.answer)
+    lengths = {len(sample.frames) for sample in samples}
     if len(lengths) != 1:
         raise InputError("the training set has windows of different lengths", got=f"{sorted(lengths)} frames")
-    ordered = sorted(looks, key=lambda look: (look.views, look.size_px, look.depth_range_m))
-    limit = max_pixels or max(math.prod(look.size_px) for look in ordered)
-    prompts = dict(sorted(prompts.items()))
-    return ChatFormat(prompts=prompts, num_frames=lengths.pop(), looks=ordered, max_pixels=limit, decision=decision)
+    looks = {FrameFormat(views=s.views, size_px=s.picture_px, depth_range_m=s.depth_range_m) for s in samples}
+    prompts = {sample.language: sample.prompt for sample in reversed(samples)}  # the first of each language
+    return ChatFormat(
+        prompts=dict(sorted(prompts.items())),
+        num_frames=lengths.pop(),
+        looks=sorted(looks, key=lambda look: (look.views, look.size_px, look.depth_range_m)),
+        max_pixels=max_pixels or max(math.prod(look.size_px) for look in looks),
+        decision=decision_place(samples[-1].answer),
+    )
 
 
 def add_adapter(student: Student, cfg: TrainConfig, seed: int) -> Student:
@@ -99,14 +95,6 @@ def target_modules(student: Student) -> str:
     return rf"{re.escape(prefix)}\.(.*\.)?({'|'.join(map(re.escape, sorted(names)))})"
 
 
-def vision_modules(student: Student) -> list[Any]:
-    """Return the parts of the model that are not its language model and not its output head."""
-    if not student.has_pictures:
-        return []
-    language = {*student.core.get_decoder().modules(), student.core.get_output_embeddings()}
-    return [child for child in student.core.base_model.children() if child not in language]
-
-
 def prepared_student(cfg: TrainConfig, base: Path, seed: int, device: str) -> Student:
     """Load a student and prepare it for training."""
     template = read_text(Path(cfg.chat_template), what="chat template") if cfg.chat_template else ""
@@ -116,9 +104,11 @@ def prepared_student(cfg: TrainConfig, base: Path, seed: int, device: str) -> St
         student = add_adapter(student, cfg, seed)
     else:
         student.model.requires_grad_(True)
-        for module in () if cfg.train_vision else vision_modules(student):
-            module.requires_grad_(False)
-            module.to(student.dtype)
+        language = {*student.core.get_decoder().modules(), student.core.get_output_embeddings()}
+        for module in student.core.base_model.children() if student.has_pictures and not cfg.train_vision else ():
+            if module not in language:
+                module.requires_grad_(False)
+                module.to(student.dtype)
     if cfg.compile:
         for layer in student.core.get_decoder().layers:
             layer.compile(dynamic=True)

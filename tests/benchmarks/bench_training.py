@@ -25,6 +25,7 @@ from accelerate import Accelerator
 from peft import LoraConfig, get_peft_model
 from safetensors.torch import load_file, save_file
 
+from cosfly.viz.frame_views import Pictures
 from distill.student.chat import EncodedSample, padded
 from distill.student.features import FramePicture, Tensors, encode
 from distill.student.model import Student, compute_dtype, pick_device
@@ -123,12 +124,12 @@ def make_rows(shape: str, count: int, seed: int) -> list[tuple[EncodedSample, li
         kinds = (ids == IMAGE).astype(np.int64)
         encoded = EncodedSample(ids, answers, np.ones(len(answers), np.float32), kinds)
         frames = [str(seed * count + number + i) for i in range(PICTURES)] if size_px else []
-        rows.append((encoded, [FramePicture("run", frame, "rgb", size_px, 100.0) for frame in frames]))
+        rows.append((encoded, [FramePicture("run", frame, Pictures(("rgb",), size_px)) for frame in frames]))
     return rows
 
 
 def noise_of(picture: FramePicture, dtype: Any) -> Tensors:
-    width_px, height_px = picture.size_px
+    width_px, height_px = picture.picture.size_px
     values = np.random.default_rng(int(picture.frame)).standard_normal((height_px * width_px // 256, 1536), np.float32)
     grid = torch.tensor([[1, height_px // 16, width_px // 16]])
     return {"pixel_values": torch.from_numpy(values).to(dtype), "image_grid_thw": grid}
