@@ -2,7 +2,7 @@
 
 training_set.json                          the playback trees, how the set was split, and the samples of each split
 train.parquet  val.parquet  test.parquet   one sample per row; a split without samples has no file
-README.md                                  for `datasets.load_dataset`
+README.md                                  what is in it; `datasets.load_dataset` opens the folder
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from pydantic import BaseModel
 from cosfly.formats.captions import FIELDS, Language, Place, Prompt
 from cosfly.formats.frames import frame_name
 from cosfly.formats.predictions import Split
-from cosfly.geometry.splits import SPLITS
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_file, write_bytes
 from cosfly.runtime.json_io import FileFormat, Record, dump_json, read_model, validated
@@ -113,8 +112,7 @@ def read_training_set(dataset: Path) -> TrainingSet:
 
 def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
     """Return which of the given playback trees belongs to which run of a training set: run -> tree."""
-    trees = read_training_set(dataset).trees
-    wanted = {tree.sha256: tree.run for tree in trees}
+    wanted = {tree.sha256: tree.run for tree in read_training_set(dataset).trees}
     found = {fingerprint(path): path for path in data if wanted}  # none for a set without pictures
     for digest, path in found.items():
         if digest not in wanted:
@@ -125,7 +123,7 @@ def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
     if missing := [run for digest, run in wanted.items() if digest not in found]:
         what, fix = "a playback tree of the training set is missing", "pass --data once for each of its trees"
         raise InputError(what, where=dataset, expected=f"--data also for the runs {', '.join(missing)}", fix=fix)
-    return {tree.run: found[tree.sha256] for tree in trees}
+    return {run: found[digest] for digest, run in wanted.items()}
 
 
 def tree_inputs(trees: Collection[Path], captions: Collection[Path] = ()) -> dict[str, Path]:
@@ -190,14 +188,11 @@ def write_splits(
 
 
 def write_page(out: Path, title: str, samples: Mapping[Split, int], trees: Sequence[SourceTree], text: str) -> Path:
-    """Write README.md of a folder of splits, whose header lets `datasets.load_dataset` open it."""
-    names = {"train": "train", "val": "validation", "test": "test"}  # as `datasets` calls them
-    found = [split for split in SPLITS if samples[split]]
-    files = "".join(f"  - split: {names[split]}\n    path: {split}.parquet\n" for split in found)
-    counts = "".join(f"- {names[split]}: {samples[split]} samples\n" for split in found)
-    runs = dump_json([tree.run for tree in trees])
-    pictures = f"Its pictures are the frames `window` of the playback trees of {runs}, which are not part of it.\n"
-    pictures = pictures if trees else "Its samples have no pictures.\n"
-    header = f"---\nconfigs:\n- config_name: default\n  data_files:\n{files}---\n"
-    write_bytes(out / PAGE, f"{header}# {title}\n\n{counts}\n{text}\n{pictures}".encode())
+    """Write README.md of a folder of splits."""
+    counts = "".join(f"- {split}: {count} samples\n" for split, count in samples.items() if count)
+    pictures = "Its samples have no pictures.\n"
+    if trees:
+        runs = dump_json([tree.run for tree in trees])
+        pictures = f"Its pictures are the frames `window` of the playback trees of {runs}, which are not part of it.\n"
+    write_bytes(out / PAGE, f"# {title}\n\n{counts}\n{text}\n{pictures}".encode())
     return out / PAGE

@@ -93,14 +93,12 @@ class WindowDataset(Sequence[WindowData]):
     def __init__(self, source: str | Path, *, language: Language = "en", split: str | None = None) -> None:
         self.language = language
         self.folder = _release_folder(Path(source))
-        names = _shards_of(self.folder, split)
+        paths = _shards_of(self.folder, split)
         texts = [f"caption_{language}_{field}" for field in FIELDS]
         prompts = [f"system_{language}", f"prompt_{language}"]
         self._columns = ["image", *FACTS, *texts, *prompts, "caption_picture_px", "label", "verdict"]
-        self._shards = [TableRows(inside(self.folder, name), self._columns) for name in names]
-        self._places = [
-            place for number, name in enumerate(names) for place in self._places_in(number, inside(self.folder, name))
-        ]
+        self._shards = [TableRows(path, self._columns) for path in paths]
+        self._places = [place for number, path in enumerate(paths) for place in self._places_in(number, path)]
         if not self._places:
             what, expected = "the source has no usable window", f"accepted captions in {language!r} whose frames exist"
             fix = "build the release with --set release.selection=windows, which keeps consecutive frames"
@@ -110,7 +108,12 @@ class WindowDataset(Sequence[WindowData]):
         """Yield the windows of a shard, which contains whole tracks."""
         text = f"caption_{self.language}_reasoning_trace"
         light = [*PLACE, "frame_index", "sample_id", "caption_window", text]
-        _check_columns(path, self.folder, [*self._columns, *light])
+        with open_table(path, tree=self.folder) as table:
+            types = {field.name: field.type for field in table.schema_arrow}
+        if wrong := [name for name in (*self._columns, *light) if types.get(name) != TYPES.get(name, pa.string())]:
+            fix = "build the release with this version of cosfly, or download it with --modality rgb"
+            got = ", ".join(wrong)[:200]
+            raise InputError("columns are missing or have the wrong type", where=path, got=got, fix=fix)
         rows: dict[tuple[str, ...], dict[int, int]] = {}
         captioned: list[tuple[tuple[str, ...], str, tuple[int, ...]]] = []
         for number, row in enumerate(rows_of(path, light, tree=self.folder)):
@@ -167,24 +170,15 @@ def _release_folder(source: Path) -> Path:
     raise InputError("the source contains no release", where=source, expected="release.json", fix=fix)
 
 
-def _shards_of(folder: Path, split: str | None) -> list[str]:
-    """Return the names of the shards of one split, or of all."""
+def _shards_of(folder: Path, split: str | None) -> list[Path]:
+    """Return the shards of one split, or of all."""
     path = folder / "release.json"
     record = validated(_Record, read_object(path, what="release", tree=folder), path)
     splits = sorted({shard.split for shard in record.shards})
     if split is not None and split not in splits:
         near, expected = nearest(split, splits), ", ".join(splits)
         raise ConfigError(f"the release has no split of this name{near}", where=folder, got=split, expected=expected)
-    return [shard.path for shard in record.shards if split in (None, shard.split)]
-
-
-def _check_columns(path: Path, tree: Path, wanted: Sequence[str]) -> None:
-    """Check that a shard has these columns with the right types."""
-    with open_table(path, tree=tree) as table:
-        found = {field.name: field.type for field in table.schema_arrow}
-    if wrong := ", ".join(name for name in wanted if found.get(name) != TYPES.get(name, pa.string())):
-        fix = "build the release with this version of cosfly, or download it with --modality rgb"
-        raise InputError("columns are missing or have the wrong type", where=path, got=wrong[:200], fix=fix)
+    return [inside(folder, shard.path) for shard in record.shards if split in (None, shard.split)]
 
 
 def _column(rows: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:

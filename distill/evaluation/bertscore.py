@@ -17,7 +17,7 @@ from cosfly.runtime.json_io import Record
 from distill.student.model import pick_device, quiet_transformers, require
 
 BATCH_SIZE = 64  # texts embedded together
-GROUP = 1024  # references whose embeddings are in memory at the same time
+GROUP = 1024  # pairs of texts whose embeddings are in memory at the same time
 UNLIMITED = 10**6  # a tokenizer without a limit of its own has a larger number
 
 
@@ -91,14 +91,13 @@ class Scorer:
             author -> (n, 3) precision, recall and F1; 0 for an empty text.
         """
         scores = {name: np.zeros((len(references), 3)) for name in candidates}
-        with progress_bar(f"BERTScore, {self.metric.model}", total=len(references)) as advance:
-            for first in range(0, len(references), GROUP):
-                places = range(first, min(first + GROUP, len(references)))
-                pairs = [(name, k) for name, texts in candidates.items() for k in places if texts[k] and references[k]]
-                if pairs:
-                    texts = [candidates[name][k] for name, k in pairs]
-                    found = self._library.score(texts, [references[k] for _, k in pairs], batch_size=BATCH_SIZE)
-                    for (name, k), row in zip(pairs, np.stack([part.numpy() for part in found], axis=1), strict=True):
-                        scores[name][k] = row
-                advance(len(places))
+        pairs = [(k, name) for k, text in enumerate(references) for name in candidates if text and candidates[name][k]]
+        with progress_bar(f"BERTScore, {self.metric.model}", total=len(pairs)) as advance:
+            for first in range(0, len(pairs), GROUP):
+                part = pairs[first : first + GROUP]
+                texts = [candidates[name][k] for k, name in part]
+                found = self._library.score(texts, [references[k] for k, _ in part], batch_size=BATCH_SIZE)
+                for (k, name), row in zip(part, np.stack([values.numpy() for values in found], axis=1), strict=True):
+                    scores[name][k] = row
+                advance(len(part))
         return scores

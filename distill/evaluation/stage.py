@@ -100,11 +100,13 @@ def run(
     for name, own in found.items():
         answers = [own[sample.key] for sample in asked]
         reasons = Counter(answer.reason or "unknown" for answer in answers if answer.coc is None)
+        record = read_manifest(files[name].parent).facts if files[name].with_name("manifest.json").is_file() else {}
+        speed = {"answers": 0, "seconds": 0.0} | (record.get("speed") or {})  # of the last run of `distill infer`
         students[name] = StudentRecord(
             model=", ".join(sorted({answer.model or "unknown" for answer in answers})),
             not_asked=len(samples) - len(own),
             without_decision=dict(sorted(reasons.items())),
-            samples_per_s=_samples_per_s(files[name].parent),
+            samples_per_s=speed["answers"] / speed["seconds"] if speed["answers"] and speed["seconds"] else None,
         )
     by_language = {
         language: [sample for sample in asked if sample.language == language]
@@ -129,14 +131,6 @@ def run(
     products = [out / name for name in (REPORT, "evaluation.md", "evaluation.html")]
     stage.finish(products, tally, split=splits[0], models={name: one.model for name, one in report.students.items()})
     return out / REPORT
-
-
-def _samples_per_s(folder: Path) -> float | None:
-    """Return the speed of the last run of `distill infer`; None if there is no record."""
-    if not (folder / "manifest.json").is_file():
-        return None
-    speed = read_manifest(folder).facts.get("speed") or {}
-    return speed["answers"] / speed["seconds"] if speed.get("answers") and speed.get("seconds") else None
 
 
 def asked_samples(samples: Sequence[Sample], predictions: Predictions) -> list[Sample]:

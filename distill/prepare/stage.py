@@ -22,7 +22,7 @@ from cosfly.formats.frames import frame_name, frame_path
 from cosfly.formats.places import Place as TrackPlace
 from cosfly.formats.places import flight_ids, folder_name, sample_id
 from cosfly.formats.places import place_of as track_place
-from cosfly.formats.playback import Track, read_track
+from cosfly.formats.playback import read_track
 from cosfly.formats.predictions import Split
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.splits import SPLITS, Course, assign_splits, town_family, walks_of
@@ -236,7 +236,9 @@ class _Tracks:
         size_px = scaled_size(track.camera.width_px, track.camera.height_px, max(sample.picture_px))
         if sample.views and size_px != sample.picture_px:
             return "picture_of_another_size"
-        return sample.model_copy(update={"past": _past_of(track, sample.window)})
+        is_ordered = track.mission is not None and track.mission.order_at(sample.window[-1]) is not None
+        past = past_of(track, sample.window, is_ordered).round(DIGITS)  # for the baselines without pictures
+        return sample.model_copy(update={"past": tuple(past.tolist())})
 
     def _frames_of(self, folder: Path, key: str, town: str) -> frozenset[int]:
         """Return the frames of a track that have all files of the views, and note its course."""
@@ -246,12 +248,6 @@ class _Tracks:
         self.courses.append(Course(key, town, track.time_s, track.walked_m).at_seconds())
         frames = [folder / frame_name(index) for index in range(len(track))]
         return frozenset(i for i, frame in enumerate(frames) if all(frame_path(frame, f).is_file() for f in files))
-
-
-def _past_of(track: Track, window: Sequence[int]) -> tuple[float, ...]:
-    """Return the geometry of the last frames, for the baselines without pictures."""
-    is_ordered = track.mission is not None and track.mission.order_at(window[-1]) is not None
-    return tuple(past_of(track, window, is_ordered).round(DIGITS).tolist())
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------

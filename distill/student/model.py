@@ -174,14 +174,6 @@ def load_config(path: Path, *, allow_code: bool = False) -> Any:
         return AutoConfig.from_pretrained(**arguments)
 
 
-def is_vision_language(config: Any) -> bool:
-    """Return whether a student is a model for images and text, and not one for text alone."""
-    from transformers.models.auto.modeling_auto import MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING
-
-    own = getattr(config, "auto_map", None) or {}
-    return type(config) in MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING or "AutoModelForImageTextToText" in own
-
-
 def _picture_processor(config: Any, tokenizer: Any, arguments: dict[str, Any]) -> Any:
     """Put the processor of a family together without its video part, which needs torchvision and is never used."""
     from transformers import AutoImageProcessor
@@ -236,12 +228,14 @@ def load_student(
     import torch
     from peft import PeftModel
     from transformers import AutoModelForCausalLM, AutoModelForImageTextToText, AutoTokenizer
+    from transformers.models.auto.modeling_auto import MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING
 
     quiet_transformers()
     device_name = pick_device(device)
     computed = compute_dtype(dtype, device_name)
     config, arguments = load_config(path, allow_code=allow_code), _arguments(path, allow_code)
-    sees = is_vision_language(config)
+    own = getattr(config, "auto_map", None) or {}
+    sees = type(config) in MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING or "AutoModelForImageTextToText" in own
     with loading_errors("tokenizer of the student", path):
         tokenizer: Any = AutoTokenizer.from_pretrained(**arguments)
     library = None

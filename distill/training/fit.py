@@ -147,25 +147,19 @@ def train_step(
     return {"loss": total / weight, "gradient_norm": norm, **{name: int(count) for name, count in counts.items()}}
 
 
-def _digest_of_used(context: TrainingContext) -> str:
-    """Return a digest of the samples that are used, on which the order of the steps depends; equal in all processes."""
-    from accelerate.utils import gather_object
-
-    places = [[sample.place for sample in split.used] for split in (context.train, context.val)]
-    digest = sha256_bytes(dump_json(places).encode())
-    if len(set(gather_object([digest]))) > 1:
-        fix = "check that all processes can read the same pictures, then run the same command again"
-        raise InputError("the processes can use different samples", where=STAGE, fix=fix)
-    return digest
-
-
 def fit(context: TrainingContext, out: Path) -> Progress:
     """Train, from the newest checkpoint of `out` if there is one; leave the student with the weights of the product.
 
     Writes `log.jsonl` and `checkpoints/` in `out`.
     """
+    from accelerate.utils import gather_object
+
     student, cfg, accelerator, folder = context.student, context.cfg, context.accelerator, out / CHECKPOINTS
-    used = _digest_of_used(context)
+    places = [[sample.place for sample in split.used] for split in (context.train, context.val)]
+    used = sha256_bytes(dump_json(places).encode())  # the order of the steps depends on the samples that are used
+    if len(set(gather_object([used]))) > 1:
+        fix = "check that all processes can read the same pictures, then run the same command again"
+        raise InputError("the processes can use different samples", where=STAGE, fix=fix)
     optimizer, newest = make_optimizer(student, cfg), newest_checkpoint(folder)
     progress = load_checkpoint(newest, student, optimizer) if newest else Progress(samples=used)
     if progress.samples != used:
