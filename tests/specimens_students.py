@@ -59,7 +59,7 @@ def pixels_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Path]
     """The inputs of the pictures of some samples, as they are read."""
     import torch
 
-    reader = PictureReader(own, trees, own.dtype, MAX_PIXELS)
+    reader = PictureReader(own, trees, MAX_PIXELS)
     read = [reader.read(picture) for sample in samples for picture in pictures_of(sample)]
     return {name: torch.cat([one[name] for one in read]) for name in (read[0] if read else ())}
 
@@ -68,7 +68,7 @@ def features_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Pat
     """The features of the pictures of some samples, each encoded by itself."""
     import torch
 
-    reader = PictureReader(own, trees, own.dtype, MAX_PIXELS)
+    reader = PictureReader(own, trees, MAX_PIXELS)
     with torch.no_grad():
         return [encode(own, [reader.read(picture)])[0] for sample in samples for picture in pictures_of(sample)]
 

@@ -49,16 +49,6 @@ log = logging.getLogger(__name__)
 WAITING = 16
 
 
-def make_request(
-    sample: Sample, trees: Mapping[str, Path], sampling: StudentEndpointConfig, max_pixels: int
-) -> Request:
-    """Return a sample as chat messages: its pictures as the student was taught to see them, then the question."""
-    folders = [inside(trees[sample.run], frame) for frame in sample.frames]
-    frames = [[picture_to_send(view, max_pixels) for view in sample.pictures.read(folder)] for folder in folders]
-    schema = answer_schema(language=sample.language, place=decision_place(sample.answer))
-    return student_request(sample.prompt, frames, schema, sampling)
-
-
 STAGE = "distill.infer"
 ANSWERS = "answers"  # the folder of journals
 
@@ -183,7 +173,7 @@ class LocalAnswers:
             log.warning("%s: the student takes no pictures: it answers from the text state alone", STAGE)
         self.book, self.model, self.batch_size, self.max_tokens = book, inputs.name, cfg.batch_size, cfg.max_new_tokens
         self.max_pixels = cfg.max_pixels or inputs.taught_pixels
-        self._reader = PictureReader(self.student, inputs.trees, self.student.dtype, self.max_pixels)
+        self._reader = PictureReader(self.student, inputs.trees, self.max_pixels)
 
     async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[SampleOutcome, None]:
         """Yield the outcome of each sample, in their order; `advance` is called after each batch."""
@@ -268,12 +258,19 @@ class EngineAnswers:
             for outcome in await asyncio.gather(*(self._ask(sample, advance) for sample in part)):
                 yield outcome
 
+    def _request(self, sample: Sample) -> Request:
+        """Return a sample as chat messages: its pictures as the student was taught to see them, then the question."""
+        folders = [inside(self.trees[sample.run], frame) for frame in sample.frames]
+        pictures = [sample.pictures.read(folder) for folder in folders]
+        frames = [[picture_to_send(picture, self.max_pixels) for picture in views] for views in pictures]
+        schema = answer_schema(language=sample.language, place=decision_place(sample.answer))
+        return student_request(sample.prompt, frames, schema, self.sampling)
+
     async def _ask(self, sample: Sample, advance: Advance) -> SampleOutcome:
         flight = flight_of(sample.sample_id)
         async with self._slots:
             try:
-                how = self.sampling, self.max_pixels
-                request = await asyncio.to_thread(make_request, sample, self.trees, *how)
+                request = await asyncio.to_thread(self._request, sample)
                 reply = await self._kept.ask(request, flight, sample.sample_id, sample.language)
             except InputError as error:
                 return SampleOutcome.failed(sample, error.code, error)

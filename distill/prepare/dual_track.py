@@ -21,7 +21,7 @@ from cosfly.geometry.splits import SPLITS, Course, walks_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, fingerprint, write_failures
-from distill.prepare.stage import SplitConfig, check_names, run_of
+from distill.prepare.stage import SplitConfig, check_names, run_of, track_key
 from distill.schema import SourceTree, SplitMember, tree_inputs, write_page, write_splits
 
 STAGE = "distill.dual_track"
@@ -92,7 +92,7 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
             try:
                 pair = None if folder.name == ORIGINAL else _read_pair(folder, cfg)
             except InputError as error:
-                failures.append(Failed(id=f"{_key(place)}/{place.variant}", code=error.code, message=str(error)))
+                failures.append(Failed(id=f"{track_key(place)}/{place.variant}", code=error.code, message=str(error)))
                 tally.count(failures[-1])
                 continue
             if isinstance(pair, str):
@@ -104,27 +104,23 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
     tally.input = tally.kept + tally.dropped.total() + len(failures)
     if not pairs:
         raise stage.nothing_kept(tally, expected=f"a perturbed track of {cfg.length} frames with its clean track")
-    walks = walks_of(Course(_key(at), at.town, twin.time_s, twin.walked_m) for at, (_, twin) in pairs.items())
+    walks = walks_of(Course(track_key(at), at.town, twin.time_s, twin.walked_m) for at, (_, twin) in pairs.items())
     split_of = cfg.assigned(walks, walks, seed)
-    tracks = {split: [place for place in pairs if split_of[_key(place)] == split] for split in SPLITS}
+    tracks = {split: [place for place in pairs if split_of[track_key(place)] == split] for split in SPLITS}
     samples = {
-        split: (s for at in own for s in samples_of(at, ids[at], *pairs[at], walks[_key(at)], cfg))
+        split: (s for at in own for s in samples_of(at, ids[at], *pairs[at], walks[track_key(at)], cfg))
         for split, own in tracks.items()
     }
     counts, paths = write_splits(out, TrackSample, samples)
     sources = [SourceTree(run=name, sha256=fingerprint(tree)) for name, tree in runs.items()]
     page = write_page(out, "Windows over two tracks", counts, sources, PAGE_TEXT.format(cfg=cfg))
     facts = {
-        split: {"samples": counts[split], "tracks": len(own), "walks": len({walks[_key(place)] for place in own})}
+        split: {"samples": counts[split], "tracks": len(own), "walks": len({walks[track_key(place)] for place in own})}
         for split, own in tracks.items()
     }
     num_uneven = sum(len(windows_of(len(track), cfg)) for track, _ in pairs.values()) - sum(counts.values())
     stage.finish([*paths, page], tally, splits=facts, windows_left_out={"uneven_steps": num_uneven})
     return out
-
-
-def _key(place: Place) -> str:
-    return f"{place.run}/{place.town}/{place.trajectory}"
 
 
 def _read_pair(folder: Path, cfg: DualTrackConfig) -> tuple[Track, Track] | str | None:

@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -189,12 +189,9 @@ def make_sample(
     )
 
 
-class _Window(NamedTuple):
-    """The samples of one caption in all languages, and the reasons for missing ones. key: `run/town/trajectory`."""
-
-    key: str
-    samples: list[Sample]
-    reasons: list[str]
+def track_key(of: TrackPlace | Sample) -> str:
+    """Return the name of a track and of its other variants."""
+    return f"{of.run}/{of.town}/{of.trajectory}"
 
 
 class _Tracks:
@@ -208,24 +205,18 @@ class _Tracks:
         trees = [(source.run, source.data) for source in sources] if len(sources) > 1 else []
         self._ids = flight_ids([track_place(folder, run) for run, tree in trees for folder in find_tracks(tree)])
 
-    def windows(self) -> Iterator[_Window]:
-        """Yield the windows of all captions."""
+    def windows(self) -> Iterator[list[Sample | str]]:
+        """Yield the samples of each caption, one per language, with a reason in place of a missing one."""
         for source in self._sources:
             for caption in read_captions(source.captions):
-                place = TrackPlace(source.run, caption.town, caption.trajectory, caption.variant)
-                window = _Window(f"{source.run}/{caption.town}/{caption.trajectory}", [], [])
-                for language in self._cfg.languages:
-                    found = self._sample(source, place, window.key, caption, language)
-                    (window.samples if isinstance(found, Sample) else window.reasons).append(found)  # type: ignore[arg-type]
-                yield window
+                yield [self._sample(source, caption, language) for language in self._cfg.languages]
 
-    def _sample(
-        self, source: RunSource, place: TrackPlace, key: str, caption: Caption, language: Language
-    ) -> Sample | str:
+    def _sample(self, source: RunSource, caption: Caption, language: Language) -> Sample | str:
         """Return the sample of a caption with the past of its track, or the reason why there is none."""
+        place = TrackPlace(source.run, caption.town, caption.trajectory, caption.variant)
         folder = inside(source.data, f"{place.town}/{place.trajectory}/{place.variant}", in_parent=True)
         if folder not in self._frames:
-            self._frames[folder] = self._frames_of(folder, key, place.town)
+            self._frames[folder] = self._frames_of(folder, place)
         name = sample_id(self._ids[place], caption.frame_index) if place in self._ids else caption.sample_id
         sample = make_sample(caption, language, self._cfg, run=source.run, sample_id=name)
         if isinstance(sample, str):
@@ -240,12 +231,12 @@ class _Tracks:
         past = past_of(track, sample.window, is_ordered).round(DIGITS)  # for the baselines without pictures
         return sample.model_copy(update={"past": tuple(past.tolist())})
 
-    def _frames_of(self, folder: Path, key: str, town: str) -> frozenset[int]:
+    def _frames_of(self, folder: Path, place: TrackPlace) -> frozenset[int]:
         """Return the frames of a track that have all files of the views, and note its course."""
         if not (folder / "trajectory.json").exists():
             return frozenset()
         track, files = self._read(folder), [VIEW_FILES[view] for view in self._cfg.modalities]
-        self.courses.append(Course(key, town, track.time_s, track.walked_m).at_seconds())
+        self.courses.append(Course(track_key(place), place.town, track.time_s, track.walked_m).at_seconds())
         frames = [folder / frame_name(index) for index in range(len(track))]
         return frozenset(i for i, frame in enumerate(frames) if all(frame_path(frame, f).is_file() for f in files))
 
@@ -273,29 +264,30 @@ def run(
         record = record_of(source.captions)
         if record is None or "data" not in record.inputs:
             log.warning("%s: no record tells that these are captions of %s", source.captions, source.data)
-    tracks, windows, left_out = _Tracks(cfg, sources), dict[str, _Window](), Counter[str]()
+    tracks, windows, left_out = _Tracks(cfg, sources), dict[str, list[Sample]](), Counter[str]()
     with progress_bar(f"{STAGE}: reading", total=None) as advance:
-        for window in tracks.windows():
+        for found in tracks.windows():
             advance(1)
-            left_out.update(window.reasons)
-            if window.samples and windows.setdefault(window.samples[0].sample_id, window) is not window:
-                where, fix = window.samples[0].sample_id, "remove one of the two lines from the captions"
-                raise InputError("two captions are of the same window", where=where, fix=fix)
+            left_out.update(reason for reason in found if isinstance(reason, str))
+            own = [sample for sample in found if isinstance(sample, Sample)]
+            if own and windows.setdefault(own[0].sample_id, own) is not own:
+                fix = "remove one of the two lines from the captions"
+                raise InputError("two captions are of the same window", where=own[0].sample_id, fix=fix)
     if not windows:
         tally = Tally(input=left_out.total(), dropped=left_out)
         raise stage.nothing_kept(tally, expected="accepted captions with images below --data")
     walks = walks_of(tracks.courses)
-    split_of = cfg.assigned({window.key for window in windows.values()}, walks, seed)
+    split_of = cfg.assigned({track_key(own[0]) for own in windows.values()}, walks, seed)
     # At random, and independent of the other windows.
     ranked = sorted(windows, key=lambda name: hashlib.sha256(f"{seed}/{STAGE}/{name}".encode()).digest())
     chosen = set(ranked[: cfg.limit or None])
     samples: dict[Split, list[Sample]] = {split: [] for split in SPLITS}
-    for name, window in windows.items():
+    for name, own in windows.items():
+        key = track_key(own[0])
         if name in chosen:
-            update = {"walk": walks[window.key]}
-            samples[split_of[window.key]] += [sample.model_copy(update=update) for sample in window.samples]
+            samples[split_of[key]] += [sample.model_copy(update={"walk": walks[key]}) for sample in own]
         else:
-            left_out["limit"] += len(window.samples)
+            left_out["limit"] += len(own)
     counts, paths = write_splits(out, Sample, samples)
     pictured = sources if cfg.modalities else []
     trees = [SourceTree(run=source.run, sha256=fingerprint(source.data)) for source in pictured]

@@ -20,7 +20,6 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import inside
 from cosfly.viz.frame_views import Pictures
 from distill.schema import Sample
-from distill.student.chat import Processor
 from distill.student.model import Student
 
 TOGETHER = 16  # pictures that are read, and then encoded together
@@ -51,12 +50,11 @@ def pictures_of(sample: Sample) -> list[FramePicture]:
 class PictureReader:
     """Reads pictures, also in worker processes.
 
-    trees: run -> playback tree. dtype: torch type of the pixels. max_pixels: limit of a picture; 0: none.
+    trees: run -> playback tree. max_pixels: limit of a picture; 0: none.
     """
 
-    processor: Processor
+    student: Student
     trees: Mapping[str, Path]
-    dtype: Any
     max_pixels: int = 0
 
     def read(self, picture: FramePicture) -> Tensors:
@@ -68,9 +66,9 @@ class PictureReader:
         import torch
 
         (pixels,) = picture.picture.read(inside(self.trees[picture.run], picture.frame))
-        found = self.processor.picture_inputs(limited_picture(pixels, self.max_pixels), is_alone=picture.is_alone)
+        found = self.student.picture_inputs(limited_picture(pixels, self.max_pixels), is_alone=picture.is_alone)
         tensors = {name: torch.from_numpy(array) for name, array in found.items()}
-        return {name: t.to(self.dtype) if t.is_floating_point() else t for name, t in tensors.items()}
+        return {name: t.to(self.student.dtype) if t.is_floating_point() else t for name, t in tensors.items()}
 
     def try_to_read(self, picture: FramePicture) -> Tensors | str:
         """Read a picture; return the words of the error if that fails."""

@@ -34,7 +34,7 @@ def choose_kernels(dtype: Any, device: str) -> None:
     if dtype == torch.float32:
         for package in (LINEAR_ATTENTION, CONVOLUTION):
             sys.modules.setdefault(package, None)  # type: ignore[arg-type]  # so that its import fails
-    elif importlib.util.find_spec(CONVOLUTION) is None and importlib.util.find_spec(LINEAR_ATTENTION) is not None:
+    elif missing == [CONVOLUTION]:
         module = types.ModuleType(CONVOLUTION)
         module.__spec__ = ModuleSpec(CONVOLUTION, None)
         module.causal_conv1d_fn = _convolution  # type: ignore[attr-defined]

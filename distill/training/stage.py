@@ -270,7 +270,7 @@ def _context(
     order = rng_for(seed, STAGE, "validation").permutation(len(validation))
     train.encode(range(len(samples)), cfg.max_tokens, cfg.data_workers)
     val.encode(sorted(order[: cfg.validation_samples].tolist()), cfg.max_tokens, cfg.data_workers)
-    reader = PictureReader(student, trees, student.dtype, cfg.max_pixels)
+    reader = PictureReader(student, trees, cfg.max_pixels)
     context = TrainingContext(student, cfg, seed, accelerator, train, val, reader)
     context.read_pictures()
     for name, split in (("train", train), ("val", val)):
