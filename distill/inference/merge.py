@@ -10,7 +10,7 @@ from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_folder
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
-from distill.student.model import GGUF, load_config, load_student, loading_errors, require, student_path, weight_files
+from distill.student.model import load_student, loading_errors, require, student_path, weight_files
 from distill.student.saving import check_adapter, write_student
 
 STAGE = "distill.merge"
@@ -41,9 +41,8 @@ def run(model: Path, adapter: Path, out: Path, *, resume: Resume = "if-same") ->
     student = load_student(model, device="cpu", dtype="float32", adapter=adapter)
     with loading_errors("adapter", adapter):
         student.model = student.model.merge_and_unload()
-    dtype = None if model.suffix == GGUF else getattr(load_config(model), "dtype", None)
-    if dtype is not None:
-        student.model.to(dtype)
+    if student.stored is not None:
+        student.model.to(student.stored)
     with atomic_folder(merged) as partial:
         write_student(student, partial, model)
         shutil.copyfile(adapter / CHAT_FORMAT_FILE, partial / CHAT_FORMAT_FILE)

@@ -53,11 +53,12 @@ def quiet_transformers() -> None:
 @dataclass(kw_only=True)
 class Student(Processor):
     """A loaded student. `model` is a transformers model or a peft model around it; `dtype` is the type of the
-    computation, while weights that are trained may be kept in float32."""
+    computation, while weights that are trained may be kept in float32; `stored` is their type on disk, if known."""
 
     model: Any
     device: str
     dtype: Any
+    stored: Any = None
 
     @property
     def core(self) -> Any:
@@ -155,25 +156,6 @@ def loading_errors(what: str, where: Path) -> Iterator[None]:
         raise InputError(f"the {what} cannot be loaded", where=where, got=got, fix=fix) from error
 
 
-def _arguments(path: Path, allow_code: bool) -> dict[str, Any]:
-    """Return the arguments of transformers' `from_pretrained` for a student."""
-    common = {"local_files_only": True, "trust_remote_code": allow_code}
-    if path.suffix != GGUF:
-        return {"pretrained_model_name_or_path": path, **common}
-    require("gguf")
-    return {"pretrained_model_name_or_path": path.parent, "gguf_file": path.name, **common}
-
-
-def load_config(path: Path, *, allow_code: bool = False) -> Any:
-    """Load the configuration of a student."""
-    require("torch", "transformers")
-    from transformers import AutoConfig
-
-    arguments = _arguments(path, allow_code)
-    with loading_errors("configuration of the student", path):
-        return AutoConfig.from_pretrained(**arguments)
-
-
 def _picture_processor(config: Any, tokenizer: Any, arguments: dict[str, Any]) -> Any:
     """Put the processor of a family together without its video part, which needs torchvision and is never used."""
     from transformers import AutoImageProcessor
@@ -227,13 +209,21 @@ def load_student(
     weight_files(path)
     import torch
     from peft import PeftModel
-    from transformers import AutoModelForCausalLM, AutoModelForImageTextToText, AutoTokenizer
+    from transformers import AutoConfig, AutoModelForCausalLM, AutoModelForImageTextToText, AutoTokenizer
     from transformers.models.auto.modeling_auto import MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING
 
     quiet_transformers()
     device_name = pick_device(device)
     computed = compute_dtype(dtype, device_name)
-    config, arguments = load_config(path, allow_code=allow_code), _arguments(path, allow_code)
+    arguments: dict[str, Any] = {"local_files_only": True, "trust_remote_code": allow_code}
+    if path.suffix == GGUF:
+        require("gguf")
+        arguments |= {"pretrained_model_name_or_path": path.parent, "gguf_file": path.name}
+    else:
+        arguments["pretrained_model_name_or_path"] = path
+    with loading_errors("configuration of the student", path):
+        config = AutoConfig.from_pretrained(**arguments)
+    stored = None if path.suffix == GGUF else getattr(config, "dtype", None)
     own = getattr(config, "auto_map", None) or {}
     sees = type(config) in MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING or "AutoModelForImageTextToText" in own
     with loading_errors("tokenizer of the student", path):
@@ -266,7 +256,8 @@ def load_student(
                 warnings.filterwarnings("error", message=".*missing adapter keys")  # which stay at zero
                 model = PeftModel.from_pretrained(model, adapter)
     model.to(device_name)
-    student = Student(tokenizer, library, template, model=model, device=device_name, dtype=computed)
+    given: Any = {"model": model, "device": device_name, "dtype": computed, "stored": stored}
+    student = Student(tokenizer, library, template, **given)
     if is_fast and device_name == "cuda":
         qwen3_5.fuse_norms(student.core)
     return student
