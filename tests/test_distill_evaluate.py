@@ -15,10 +15,9 @@ from cosfly.inspection.blind_baseline import LEAST_WINDOWS
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import dump_json, read_model
 from distill.evaluation import figures
-from distill.evaluation.bertscore import Scorer
 from distill.evaluation.figures import Answers, coc_of, measure, text_of
 from distill.evaluation.report import REPORT_FORMAT, Evaluation
-from distill.evaluation.stage import asked_samples, floors_of, majority, run
+from distill.evaluation.stage import Scorer, asked_samples, floors_of, majority, run
 from distill.inference.stage import failed_prediction, make_prediction
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split

@@ -11,7 +11,6 @@ from cosfly.runtime.escaping import for_markdown
 from cosfly.runtime.json_io import FileFormat, Record
 from cosfly.viz.page import page
 from cosfly.viz.tables import TextTable
-from distill.evaluation.bertscore import Metric
 from distill.evaluation.figures import (
     BERTSCORE,
     BINS,
@@ -50,6 +49,16 @@ NOTES = [
     "The paper's columns were measured on 10,000 samples of its own data, with layer 17 of roberta-large and another "
     "teacher, so only the distance to the baselines can be compared.",
 ]
+
+
+class Metric(Record):
+    """What a score was measured with; `stage.json` has the digests. cut: References longer than max_tokens."""
+
+    model: str
+    layer: int
+    max_tokens: int
+    cut: int
+    versions: dict[str, str]
 
 
 class StudentRecord(Record):

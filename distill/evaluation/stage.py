@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +18,12 @@ from cosfly.formats.captions import TOKENS, Language, ValueCounts, read_captions
 from cosfly.formats.predictions import PREDICTIONS, Prediction, read_predictions
 from cosfly.inspection.blind_baseline import FITTED_ON, fit_deciders
 from cosfly.runtime.config import Config
+from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import write_model
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally, read_manifest
 from cosfly.runtime.seeding import rng_for
-from distill.evaluation.bertscore import Metric, Scorer, encoder_files
 from distill.evaluation.figures import (
     TEACHER,
     Answers,
@@ -37,14 +38,19 @@ from distill.evaluation.report import (
     REPORT_FORMAT,
     Evaluation,
     Example,
+    Metric,
     StudentRecord,
     markdown_of,
     page_of,
 )
 from distill.schema import Sample, open_split
+from distill.student.model import pick_device, quiet_transformers, require
 
 STAGE = "distill.evaluate"
 BASELINES = ("majority", "rule", "blind")
+BATCH_SIZE = 64  # texts embedded together
+GROUP = 1024  # pairs of texts whose embeddings are in memory at the same time
+UNLIMITED = 10**6  # a tokenizer without a limit of its own has a larger number
 NUM_EXAMPLES = 12  # samples that the page shows with their answers
 Predictions = Mapping[str, Mapping[str, Prediction]]  # student -> sample's key -> its prediction
 # (run or None, window, language, text) -> values of this text
@@ -191,6 +197,83 @@ def _examples(samples: Sequence[Sample], predictions: Predictions, most: int, se
         sample = samples[place]
         answers = {name: own[sample.key] for name, own in predictions.items()}
         yield Example(key=sample.key, walk=sample.walk, label=sample.label, reference=coc_of(sample), answers=answers)
+
+
+# --- BERTScore --------------------------------------------------------------------------------------------------------
+
+# Zhang et al. 2020, doi:10.48550/arXiv.1904.09675; settings of sec:appendix_f_caption_distillation.
+
+
+def encoder_files(folder: Path) -> list[Path]:
+    """Return the files that decide an encoder's scores: configuration, tokenizer, weights."""
+    if not (folder / "config.json").is_file():
+        expected = "a folder with config.json, tokenizer and weights"
+        raise InputError("the folder is not an encoder of transformers", where=folder, expected=expected)
+    kinds = ("*.json", "*.txt", "*.safetensors", "*.bin", "*.model")
+    return sorted({path for kind in kinds for path in folder.glob(kind) if path.is_file()})
+
+
+class Scorer:
+    """BERTScore with one encoder."""
+
+    def __init__(self, folder: Path, references: Sequence[str]) -> None:
+        """Load the encoder.
+
+        The layer is that of the library for the folder's name (17 for `roberta-large`, 8 for `bert-base-chinese`). For
+        a name that the library does not know, or an encoder with fewer layers, it is the last one.
+
+        Args:
+            references: texts that are counted if they are too long.
+        """
+        require("torch", "transformers", "bert_score")
+        quiet_transformers()
+        import bert_score
+        import torch
+        import transformers
+
+        if "t5" in str(folder) or str(folder).startswith("scibert"):
+            what = "bert-score takes every path with 't5' for a T5 model, and every 'scibert' for a download"
+            raise InputError(what, where=folder, fix="rename the folder")
+        encoder_files(folder)
+        try:
+            config = transformers.AutoConfig.from_pretrained(folder)
+            layers = config.num_hidden_layers
+            layer = min(bert_score.utils.model2layers.get(folder.name, layers), layers)
+            self._library = bert_score.BERTScorer(
+                model_type=str(folder), num_layers=layer, batch_size=BATCH_SIZE, nthreads=1, device=pick_device("auto")
+            )
+        except (OSError, ValueError, RuntimeError, AttributeError) as error:
+            raise InputError("the encoder cannot be loaded", where=folder, got=str(error)[:300]) from error
+        tokenizer = self._library._tokenizer
+        if tokenizer.model_max_length > UNLIMITED:  # the library would overflow the positions; RoBERTa reserves two
+            tokenizer.model_max_length = config.max_position_embeddings - 2
+        limit = tokenizer.model_max_length
+        self.metric = Metric(
+            model="/".join(folder.absolute().parts[-2:]),
+            layer=layer,
+            max_tokens=limit,
+            cut=sum(len(tokenizer(text, truncation=False)["input_ids"]) > limit for text in references),
+            versions={"bert-score": version("bert-score"), "torch": torch.__version__}
+            | {"transformers": transformers.__version__},
+        )
+
+    def score(self, candidates: Mapping[str, Sequence[str]], references: Sequence[str]) -> dict[str, np.ndarray]:
+        """Score several authors' texts on the same references.
+
+        Returns:
+            author -> (n, 3) precision, recall and F1; 0 for an empty text.
+        """
+        scores = {name: np.zeros((len(references), 3)) for name in candidates}
+        pairs = [(k, name) for k, text in enumerate(references) for name in candidates if text and candidates[name][k]]
+        with progress_bar(f"BERTScore, {self.metric.model}", total=len(pairs)) as advance:
+            for first in range(0, len(pairs), GROUP):
+                part = pairs[first : first + GROUP]
+                texts = [candidates[name][k] for k, name in part]
+                found = self._library.score(texts, [references[k] for k, _ in part], batch_size=BATCH_SIZE)
+                for (k, name), row in zip(part, np.stack([values.numpy() for values in found], axis=1), strict=True):
+                    scores[name][k] = row
+                advance(len(part))
+        return scores
 
 
 # --- baselines --------------------------------------------------------------------------------------------------------

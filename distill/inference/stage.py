@@ -11,7 +11,7 @@ from collections.abc import AsyncGenerator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, NamedTuple, Self
 
 from pydantic import Field
 
@@ -37,10 +37,9 @@ from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.model_json import CONTEXT_FULL
 from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, read_manifest, read_stage_record, write_failures
 from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
-from distill.student.chat import EncodedSample
-from distill.student.features import PictureReader, Tensors, pictures_of, read_features
-from distill.student.generate import Completion, generate
-from distill.student.model import Device, load_student, require, student_path, weight_files
+from distill.student.chat import EncodedSample, prompt_batch
+from distill.student.features import PictureReader, Tensors, pictures_of, read_features, shown
+from distill.student.model import Device, Student, load_student, require, student_path, weight_files
 from distill.student.saving import check_adapter
 
 log = logging.getLogger(__name__)
@@ -151,6 +150,54 @@ class Inputs:
         folder = Path(self.model).absolute()
         name = folder.parent.name if folder.name == "model" else folder.name
         return name if self.adapter is None else f"{name}+{self.adapter.absolute().parent.name}"
+
+
+class Completion(NamedTuple):
+    """An answer. num_tokens: without its end token. is_finished: it ended by itself."""
+
+    text: str
+    num_tokens: int
+    is_finished: bool
+
+
+def generate(
+    student: Student, rows: Sequence[EncodedSample], pictures: Sequence[Tensors], *, max_tokens: int
+) -> list[Completion]:
+    """Answer a batch of prompts greedily; the answers in `rows` are not used.
+
+    Args:
+        pictures: features of the pictures of all rows, row after row.
+        max_tokens: longest answer, the end token included.
+
+    Returns:
+        One answer for each row, in their order.
+    """
+    import torch
+    from transformers import GenerationConfig
+
+    core, end = student.core, student.end_token_id
+    inputs = {name: torch.from_numpy(array).to(student.device) for name, array in prompt_batch(student, rows).items()}
+    num_prompt = inputs["input_ids"].shape[1]
+    # Under autocast keys and values may be of different types, which a static cache does not hold.
+    is_one_type = core.get_input_embeddings().weight.dtype == student.dtype
+    config = GenerationConfig(
+        do_sample=False,
+        max_new_tokens=max_tokens,
+        eos_token_id=end,
+        pad_token_id=student.pad_token_id,
+        cache_implementation="static" if is_one_type else "dynamic",
+        disable_compile=True,  # a compiled step holds for one batch size and length, and costs a minute
+    )
+    core.generation_config = config  # settings for sampling of the model folder would complete those of `config`
+    student.model.eval()
+    with torch.inference_mode(), student.computing(), shown(student, pictures) as seen:
+        found = core.generate(**inputs, **seen)
+    completions = []
+    for tokens in found[:, num_prompt:].tolist():
+        written = tokens[: tokens.index(end)] if end in tokens else tokens
+        text = student.tokenizer.decode(written, skip_special_tokens=False).removeprefix(student.lead)
+        completions.append(Completion(text, len(written), end in tokens))
+    return completions
 
 
 class LocalAnswers:
