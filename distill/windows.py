@@ -92,8 +92,19 @@ class WindowDataset(Sequence[WindowData]):
 
     def __init__(self, source: str | Path, *, language: Language = "en", split: str | None = None) -> None:
         self.language = language
-        self.folder = _release_folder(Path(source))
-        paths = _shards_of(self.folder, split)
+        folders = [Path(source, name) for name in ("", "dataset", "release/dataset")]
+        found = [folder for folder in folders if (folder / "release.json").is_file()]
+        if not found:
+            fix = "pass a release, or build one with cosfly release build"
+            raise InputError("the source contains no release", where=source, expected="release.json", fix=fix)
+        self.folder = found[0]
+        path = self.folder / "release.json"
+        record = validated(_Record, read_object(path, what="release", tree=self.folder), path)
+        splits = sorted({shard.split for shard in record.shards})
+        if split is not None and split not in splits:
+            what, expected = f"the release has no split of this name{nearest(split, splits)}", ", ".join(splits)
+            raise ConfigError(what, where=self.folder, got=split, expected=expected)
+        paths = [inside(self.folder, shard.path) for shard in record.shards if split in (None, shard.split)]
         texts = [f"caption_{language}_{field}" for field in FIELDS]
         prompts = [f"system_{language}", f"prompt_{language}"]
         self._columns = ["image", *FACTS, *texts, *prompts, "caption_picture_px", "label", "verdict"]
@@ -160,25 +171,6 @@ class WindowDataset(Sequence[WindowData]):
             prompt=Prompt(system=system, user=user).told(sentence).model_dump(),
             caption=caption | {name: last[name] or "" for name in ("label", "verdict")},
         )
-
-
-def _release_folder(source: Path) -> Path:
-    for folder in (source, source / "dataset", source / "release/dataset"):
-        if (folder / "release.json").is_file():
-            return folder
-    fix = "pass a release, or build one with cosfly release build"
-    raise InputError("the source contains no release", where=source, expected="release.json", fix=fix)
-
-
-def _shards_of(folder: Path, split: str | None) -> list[Path]:
-    """Return the shards of one split, or of all."""
-    path = folder / "release.json"
-    record = validated(_Record, read_object(path, what="release", tree=folder), path)
-    splits = sorted({shard.split for shard in record.shards})
-    if split is not None and split not in splits:
-        near, expected = nearest(split, splits), ", ".join(splits)
-        raise ConfigError(f"the release has no split of this name{near}", where=folder, got=split, expected=expected)
-    return [inside(folder, shard.path) for shard in record.shards if split in (None, shard.split)]
 
 
 def _column(rows: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:

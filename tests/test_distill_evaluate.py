@@ -18,7 +18,7 @@ from distill.evaluation import figures
 from distill.evaluation.figures import Answers, coc_of, measure, text_of
 from distill.evaluation.report import REPORT_FORMAT, Evaluation
 from distill.evaluation.stage import Scorer, asked_samples, floors_of, majority, run
-from distill.inference.stage import failed_prediction, make_prediction
+from distill.inference.stage import make_prediction
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split
 
@@ -90,7 +90,7 @@ def test_measured_numbers_by_hand(samples):
 
 def test_failures_are_no_wrong_answers(samples):
     predictions = predictions_of(samples)
-    predictions[7] = failed_prediction(samples[7], "test", "damaged_picture")  # was right
+    predictions[7] = make_prediction(samples[7], "test", failure="damaged_picture")  # was right
     found = measured(samples, predictions).figures
     assert (found["answered"].value, found["answered"].count) == (7 / 8, 8)
     assert (found["accuracy"].value, found["accuracy"].count) == (3 / 7, 7)

@@ -228,7 +228,6 @@ class Scorer:
         require("torch", "transformers", "bert_score")
         quiet_transformers()
         import bert_score
-        import torch
         import transformers
 
         if "t5" in str(folder) or str(folder).startswith("scibert"):
@@ -253,8 +252,7 @@ class Scorer:
             layer=layer,
             max_tokens=limit,
             cut=sum(len(tokenizer(text, truncation=False)["input_ids"]) > limit for text in references),
-            versions={"bert-score": version("bert-score"), "torch": torch.__version__}
-            | {"transformers": transformers.__version__},
+            versions={name: version(name) for name in ("bert-score", "torch", "transformers")},
         )
 
     def score(self, candidates: Mapping[str, Sequence[str]], references: Sequence[str]) -> dict[str, np.ndarray]:

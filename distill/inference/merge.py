@@ -7,10 +7,9 @@ from pathlib import Path
 
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE
 from cosfly.runtime.config import Config
-from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_folder
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
-from distill.student.model import load_student, loading_errors, require, student_path, weight_files
+from distill.student.model import load_student, loading_errors, student_path, weight_files
 from distill.student.saving import check_adapter, write_student
 
 STAGE = "distill.merge"
@@ -28,10 +27,6 @@ def run(model: Path, adapter: Path, out: Path, *, resume: Resume = "if-same") ->
         InputError: the adapter belongs to another base, or cannot be merged.
         StorageError: the disk is full. EnvironmentMissing: torch, transformers or peft is missing.
     """
-    require("torch", "transformers", "peft")
-    if (adapter / "config.json").is_file():
-        fix = "use this folder as the model"
-        raise InputError("the folder has a whole model, so there is nothing to merge", where=adapter, fix=fix)
     model = student_path(str(model))
     inputs = {**weight_files(model), **check_adapter(adapter, model)}
     stage = StageFolder.open(out, STAGE, config=Config(), inputs=inputs, seed=0, resume=resume)

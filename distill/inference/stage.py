@@ -39,7 +39,7 @@ from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, read_mani
 from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
 from distill.student.chat import EncodedSample, prompt_batch
 from distill.student.features import PictureReader, Tensors, pictures_of, read_features, shown
-from distill.student.model import Device, Student, load_student, require, student_path, weight_files
+from distill.student.model import Device, Student, load_student, student_path, weight_files
 from distill.student.saving import check_adapter
 
 log = logging.getLogger(__name__)
@@ -103,7 +103,7 @@ class SampleOutcome:
     def prediction(self, split: Split, model: str) -> Prediction:
         """Return the record of the sample."""
         if isinstance(self.found, Failed):
-            record = failed_prediction(self.sample, split, self.found.code)
+            record = make_prediction(self.sample, split, failure=self.found.code)
         else:
             is_finished = self.found.finish_reason not in ("length", CONTEXT_FULL)
             num_tokens = self.found.usage.get("completion_tokens", 0)
@@ -111,19 +111,19 @@ class SampleOutcome:
         return record.model_copy(update={"model": model})
 
 
-def make_prediction(sample: Sample, split: Split, text: str, num_tokens: int, is_finished: bool) -> Prediction:
-    """Parse an answer and return its record."""
+def make_prediction(
+    sample: Sample, split: Split, text: str = "", num_tokens: int = 0, is_finished: bool = False, *, failure: str = ""
+) -> Prediction:
+    """Parse an answer and return its record; without an answer, its reason counts as no wrong answer.
+
+    Args:
+        failure: code of the reason why there is no answer.
+    """
     parsed = parse_answer(text, sample.language, finish_reason=None if is_finished else "length")
     own = sample.model_dump(include={"sample_id", "language", "run", "window_id"})
     answer = {"raw": text, "num_tokens": num_tokens, "is_finished": is_finished}
-    return Prediction(
-        **own, **answer, split=split, coc=parsed.coc, reason=parsed.reason, recovered=list(parsed.recovered)
-    )
-
-
-def failed_prediction(sample: Sample, split: Split, code: str) -> Prediction:
-    """Return the record of a sample without an answer: empty, with a reason that counts as no wrong answer."""
-    return make_prediction(sample, split, "", 0, False).model_copy(update={"reason": f"{FAILED}{code}"})
+    reason = f"{FAILED}{failure}" if failure else parsed.reason
+    return Prediction(**own, **answer, split=split, coc=parsed.coc, reason=reason, recovered=list(parsed.recovered))
 
 
 # --- students in this process, and engines ----------------------------------------------------------------------------
@@ -287,10 +287,7 @@ class EngineAnswers:
     """An engine that answers samples."""
 
     def __init__(self, engine: Engine, book: AnswerBook, inputs: Inputs, cfg: InferConfig) -> None:
-        """
-        Args:
-            engine: started.
-        """
+        """Take an engine that was started."""
         self.engine, self.book, self.trees, self.sampling = engine, book, inputs.trees, cfg.sampling
         self.max_pixels = cfg.max_pixels or (inputs.taught_pixels if cfg.engine == "vllm" else 0)
         self._most = cfg.endpoint.concurrency if cfg.engine == "endpoint" else cfg.vllm.batch
@@ -322,7 +319,11 @@ class EngineAnswers:
             except InputError as error:
                 return SampleOutcome.failed(sample, error.code, error)
             except NoAnswer as error:
-                self._note_failure(error)
+                self._failed_in_row += not error.is_final  # otherwise the server answers, if only with a refusal
+                if self._failed_in_row >= STOP_AFTER_FAILURES:
+                    words = f"{self._failed_in_row} samples in a row got no answer"
+                    fix = "fix the server, then run the same command again; answered samples are not asked again"
+                    raise TeacherError(words, where=self.engine.where, got=str(error), fix=fix) from error
                 return SampleOutcome.failed(sample, error.cause, error)
             finally:
                 advance(1)
@@ -330,15 +331,6 @@ class EngineAnswers:
         found = self.book.get(flight, answer_key(self.engine.model, request))
         assert found is not None, "the answer was recorded"
         return SampleOutcome(sample, found, is_new=not reply.is_kept)
-
-    def _note_failure(self, error: NoAnswer) -> None:
-        if error.is_final:  # the server answers, if only with a refusal
-            return
-        self._failed_in_row += 1
-        if self._failed_in_row >= STOP_AFTER_FAILURES:
-            words = f"{self._failed_in_row} samples in a row got no answer"
-            fix = "fix the server, then run the same command again; answered samples are not asked again"
-            raise TeacherError(words, where=self.engine.where, got=str(error), fix=fix)
 
 
 def _with_model_name(cfg: InferConfig, url: str, out: Path) -> InferConfig:
@@ -352,9 +344,10 @@ def _with_model_name(cfg: InferConfig, url: str, out: Path) -> InferConfig:
         async with started(client):
             return client.model
 
-    is_complete = (out / "manifest.json").is_file() and not read_manifest(out).counts.failed
-    recorded = read_stage_record(out).config.get("endpoint", {}).get("model") if is_complete else None
-    name = cfg.endpoint.model or recorded if is_complete else asyncio.run(ask())
+    if (out / "manifest.json").is_file() and not read_manifest(out).counts.failed:
+        name = cfg.endpoint.model or read_stage_record(out).config.get("endpoint", {}).get("model")
+    else:
+        name = asyncio.run(ask())
     return cfg.model_copy(update={"endpoint": cfg.endpoint.model_copy(update={"model": name})})
 
 
@@ -386,9 +379,7 @@ def run(
     """
     trees = resolve_trees(dataset, data)
     files: dict[str, Path] = {"dataset": dataset, **tree_inputs(trees.values())}
-    if cfg.engine == "transformers":
-        require("torch", "transformers", "peft")
-    elif adapter is not None:
+    if adapter is not None and cfg.engine != "transformers":
         fix = "merge the adapter into its model with cosfly distill merge, or pass --engine transformers"
         words = "only the engine transformers can load an adapter"
         raise ConfigError(words, where=f"{STAGE}.engine", got=cfg.engine, fix=fix)

@@ -256,8 +256,6 @@ def load_student(
                 warnings.filterwarnings("error", message=".*missing adapter keys")  # which stay at zero
                 model = PeftModel.from_pretrained(model, adapter)
     model.to(device_name)
-    given: Any = {"model": model, "device": device_name, "dtype": computed, "stored": stored}
-    student = Student(tokenizer, library, template, **given)
     if is_fast and device_name == "cuda":
-        qwen3_5.fuse_norms(student.core)
-    return student
+        qwen3_5.fuse_norms(model)
+    return Student(tokenizer, library, template, model=model, device=device_name, dtype=computed, stored=stored)

@@ -93,7 +93,8 @@ def check_adapter(adapter: Path, model: Path) -> dict[str, Path]:
     path = adapter / ADAPTER_FACTS
     if not path.is_file() or not (adapter / CHAT_FORMAT_FILE).is_file():
         expected = f"{ADAPTER_FACTS} and {CHAT_FORMAT_FILE} of a finished cosfly distill train"
-        raise InputError("the folder is not an adapter", where=adapter, expected=expected)
+        fix = "pass the folder adapter/ of a training; the folder model/ of a training is a whole model"
+        raise InputError("the folder is not an adapter", where=adapter, expected=expected, fix=fix)
     wanted, found = read_model(path, AdapterFacts, ADAPTER_FORMAT).base_sha256, base_digests(model)
     if wanted != found:
         got, expected, fix = str(found)[:120], str(wanted)[:120], "pass the base model of this adapter"

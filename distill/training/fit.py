@@ -96,9 +96,8 @@ def make_optimizer(student: Student, cfg: TrainConfig) -> Any:
     """Make AdamW of the weights that learn."""
     import torch
 
-    parameters = list(learning_weights(student).values())
-    is_fused = student.device == "cuda"
-    return torch.optim.AdamW(parameters, lr=cfg.learning_rate, weight_decay=0.0, fused=is_fused)
+    own: Any = {"lr": cfg.learning_rate, "weight_decay": 0.0, "fused": student.device == "cuda"}
+    return torch.optim.AdamW(learning_weights(student).values(), **own)
 
 
 def add_gradients(parameters: Sequence[Any], accelerator: Any) -> None:

@@ -128,13 +128,10 @@ class TrainingSplit:
 
     def skip_unreadable(self, unreadable: Mapping[FramePicture, str]) -> None:
         """Skip the samples with a picture that cannot be read."""
-        used, self.used = self.used, []
-        for sample in used:
-            words = next((unreadable[picture] for picture in sample.pictures if picture in unreadable), None)
-            if words is None:
-                self.used.append(sample)
-            else:
-                self.skipped["unreadable_picture"].append(words)
+        errors = [next((unreadable[p] for p in sample.pictures if p in unreadable), "") for sample in self.used]
+        if any(errors):
+            self.skipped["unreadable_picture"] += filter(None, errors)
+            self.used = [sample for sample, words in zip(self.used, errors, strict=True) if not words]
 
     @property
     def lengths(self) -> np.ndarray:

@@ -74,17 +74,6 @@ def chunked_loss(hidden: Any, head: Any, targets: Any, weights: Any, *, chunk: i
     return _chunked_loss().apply(hidden, head, targets, weights, chunk, dtype)
 
 
-def output_head(student: Student) -> Any:
-    """Return the weights of the head, (vocabulary, width)."""
-    import torch
-
-    head = student.core.get_output_embeddings()
-    if type(head) is not torch.nn.Linear or head.bias is not None:
-        got = type(head).__name__
-        raise ConfigError("the output head is no plain matrix", where="student", got=got, fix="use another student")
-    return head.weight
-
-
 def answer_loss(student: Student, rows: Sequence[EncodedSample], pictures: Sequence[Tensors], chunk: int) -> Any:
     """Run samples forward, padded on the right, and return the sum over all answer tokens of weight times nats.
 
@@ -98,19 +87,22 @@ def answer_loss(student: Student, rows: Sequence[EncodedSample], pictures: Seque
     with student.computing(), shown(student, pictures) as inputs:
         hidden = student.core.base_model(**given, **inputs, use_cache=False).last_hidden_state
     is_target = labels != IGNORED  # the token at i is predicted at i - 1
-    found = hidden[:, :-1][is_target], output_head(student), labels[is_target], weights[is_target]
-    return chunked_loss(*found, chunk=chunk, dtype=student.dtype)
+    head, hidden = student.core.get_output_embeddings().weight, hidden[:, :-1][is_target]
+    return chunked_loss(hidden, head, labels[is_target], weights[is_target], chunk=chunk, dtype=student.dtype)
 
 
 def check_head(student: Student) -> None:
     """Check that logits are the product of the last hidden state and the head, from which the loss is computed."""
     import torch
 
-    ids = torch.full((1, 4), student.end_token_id, device=student.device)
+    head, ids = student.core.get_output_embeddings(), torch.full((1, 4), student.end_token_id, device=student.device)
+    if type(head) is not torch.nn.Linear or head.bias is not None:
+        got = type(head).__name__
+        raise ConfigError("the output head is no plain matrix", where="student", got=got, fix="use another student")
     with torch.no_grad(), student.computing():
         logits = student.core(input_ids=ids, use_cache=False).logits.float()
         hidden = student.core.base_model(input_ids=ids, use_cache=False).last_hidden_state
-        plain = (hidden.to(student.dtype) @ output_head(student).to(student.dtype).T).float()
+        plain = (hidden.to(student.dtype) @ head.weight.to(student.dtype).T).float()
     if not torch.allclose(logits, plain, rtol=0.05, atol=0.05 * float(logits.abs().max())):
         words, got = "the student changes its logits after the head, which the loss lacks", type(student.core).__name__
         raise ConfigError(words, where="student", got=got, fix="use another student")

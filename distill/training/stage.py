@@ -16,7 +16,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from cosfly.formats.predictions import Split
 from cosfly.llm.student_chat import ChatFormat, FrameFormat, write_chat_format
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
 from cosfly.runtime.io import atomic_folder, read_text
@@ -36,7 +35,6 @@ from distill.training.settings import STAGE, TrainConfig
 
 log = logging.getLogger(__name__)
 
-TAUGHT: tuple[Split, ...] = ("train", "val")
 ADAPTER, MODEL, STUDENT = "adapter", "model", "student"
 TOKENIZER_SAMPLES = 2000  # most samples that the tokenizer of a random student is trained on
 PATIENCE = timedelta(minutes=30)  # for the slowest process: loading weights, counting tokens, validation
@@ -101,7 +99,7 @@ def prepared_student(cfg: TrainConfig, base: Path, seed: int, device: str) -> St
     given: Any = {"device": device, "dtype": cfg.dtype, "template": template, "allow_code": cfg.allow_code}
     student = load_student(base, **given, is_trained=cfg.method == "full")
     if cfg.method == "lora":
-        student = add_adapter(student, cfg, seed)
+        add_adapter(student, cfg, seed)
     else:
         student.model.requires_grad_(True)
         language = {*student.core.get_decoder().modules(), student.core.get_output_embeddings()}
@@ -256,7 +254,7 @@ def _context(
 ) -> tuple[TrainingContext, ChatFormat]:
     """Load the student and the data, check them, and log what will be trained."""
     student = prepared_student(cfg, base, seed, pick_device(cfg.device))
-    samples, validation = (open_split(dataset, split, text_only=not student.has_pictures) for split in TAUGHT)
+    samples, validation = (open_split(dataset, split, text_only=not student.has_pictures) for split in ("train", "val"))
     if not samples:
         fix = "prepare the training set with more captions, or with other fractions"
         raise InputError("the training split is empty", where=dataset, fix=fix)
