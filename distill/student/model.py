@@ -235,7 +235,7 @@ def load_student(
     if not template and adapter is not None and (adapter / TEMPLATE).is_file():
         template = read_text(adapter / TEMPLATE, what="chat template")
     Processor(tokenizer, library, template).check(path)
-    is_fast = config.model_type == qwen3_5.MODEL_TYPE
+    is_fast = config.model_type == "qwen3_5"  # a family with faster code of ours
     if is_fast:
         qwen3_5.choose_kernels(computed, device_name)
     auto_class: Any = AutoModelForImageTextToText if sees else AutoModelForCausalLM
@@ -245,8 +245,7 @@ def load_student(
         if missing := sorted(info["missing_keys"]):  # the library would draw them at random
             got, fix = f"no {missing[0]} and {len(missing) - 1} others", "download the whole model"
             raise InputError("the student has no weights for some of its layers", where=path, got=got, fix=fix)
-        if path.suffix == GGUF:
-            # The weights are plain numbers now, which can be saved.
+        if path.suffix == GGUF:  # the weights are plain numbers now, which can be saved
             model.config.__dict__.pop("quantization_config", None)
             model.__dict__.pop("hf_quantizer", None)
         if adapter is not None:

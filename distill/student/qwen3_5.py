@@ -12,7 +12,6 @@ from typing import Any
 
 log = logging.getLogger(__name__)
 
-MODEL_TYPE = "qwen3_5"
 CONVOLUTION = "causal_conv1d"  # a package with a short convolution, which transformers calls if it is installed
 LINEAR_ATTENTION = "fla"
 
