@@ -27,6 +27,7 @@ from cosfly.formats.inspection import read_inspection
 from cosfly.formats.playback import read_track, write_track
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.geometry.axes import project, world_from_camera
+from cosfly.geometry.splits import SPLITS
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
 from cosfly.runtime.errors import InputError, VerifyError
@@ -35,7 +36,7 @@ from cosfly.runtime.run_dir import read_failures
 from distill.prepare import stage as prepare
 from distill.prepare.stage import PrepareConfig
 from distill.prepare.stage import RunSource as Prepared
-from distill.schema import SPLITS, open_split
+from distill.schema import open_split
 from release.build import stage as package
 from release.build.config import ReleaseConfig
 from release.build.sources import Source
