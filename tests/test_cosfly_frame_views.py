@@ -21,7 +21,7 @@ from cosfly.formats.captions import PICTURES_MARK, Language
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.student_chat import encoded_image
-from distill.inference.stage import InferConfig, make_request
+from distill.inference.stage import EngineAnswers, InferConfig, Inputs
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample
 from specimens import make_playback_tree
@@ -117,7 +117,8 @@ def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, 
         expected = [teachers[i][view] for i in range(5) for view in views]
         for picture, wanted in zip(pictures, expected, strict=True):
             assert np.array_equal(picture, wanted)
-        request = make_request(sample, {"": tree}, InferConfig().sampling, 0)  # engines `endpoint` and `vllm`
+        inputs, cfg = Inputs((), {"": tree}, "", None), InferConfig(engine="endpoint")
+        request = EngineAnswers(None, None, inputs, cfg)._request(sample)  # as `vllm` is asked too
         kinds = [part.get("text", "picture") for part in request.messages[1]["content"]]
         assert kinds == [word for i in range(5) for word in (f"t{i}:", *["picture"] * len(views))] + [text]
         for picture, wanted in zip(sent_pictures(request.messages), expected, strict=True):
