@@ -62,6 +62,14 @@ def test_a_server_is_asked_as_the_student_was_taught(place, tmp_path):
     assert all(image.width * image.height <= 300 for image in sent)
 
 
+def test_a_server_is_asked_without_pictures_and_trees(place, tmp_path):
+    prepared(place / "tree", place / "captions.jsonl", tmp_path / "set", modalities=())
+    with TeacherServer() as server:
+        path = infer.run(settings(), tmp_path / "set", [], server.url, tmp_path / "out")
+    assert all(prediction.coc is not None for prediction in read_predictions(path))
+    assert not any("image_url" in body.decode() for body in server.bodies)
+
+
 def test_one_sample_without_an_answer_costs_no_other(place, tmp_path):
     words = ["distill", "infer", "--dataset", place / "set", "--data", place / "tree", "--engine", "endpoint"]
     words += ["--out", tmp_path / "out", "--set", "distill.infer.split=train"]

@@ -304,7 +304,8 @@ class EngineAnswers:
 
     def _request(self, sample: Sample) -> Request:
         """Return a sample as chat messages: its pictures as the student was taught to see them, then the question."""
-        folders = [inside(self.trees[sample.run], frame) for frame in sample.frames]
+        # A set without pictures needs no tree.
+        folders = [inside(self.trees[sample.run], frame) for frame in sample.frames] if sample.views else []
         pictures = [sample.pictures.read(folder) for folder in folders]
         frames = [[picture_to_send(picture, self.max_pixels) for picture in views] for views in pictures]
         schema = answer_schema(language=sample.language, place=decision_place(sample.answer))
