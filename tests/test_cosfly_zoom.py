@@ -67,7 +67,7 @@ def test_the_cameras_of_a_flight_survive_the_file(tmp_path):
     np.testing.assert_array_equal(found.intrinsics, flight.intrinsics)
     assert found.camera_at(7).focal_px == pytest.approx(2 * found.camera.focal_px)
     assert found.fovs_deg[0] < found.fovs_deg[1] == pytest.approx(60.0)
-    row = scalar_row(found, 7, None, Placement("", "walk", "train", None))
+    row = scalar_row(found, 7, None, Placement("", "walk", "train"))
     np.testing.assert_array_equal(
         matrices_of(np.array([row["intrinsics"][name] for name in INTRINSICS])[None])[0], flight.intrinsics[7]
     )

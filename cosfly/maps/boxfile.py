@@ -334,10 +334,12 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> list[_Row]:
     for where, cells in lines[1:]:
         problem = "" if len(cells) == len(names) else f"{len(cells)} cells, but the first line has {len(names)}"
         values = {name: cell for name, cell in zip(names, cells, strict=False) if cell}
-        x, y = (_number(values.get(name)) for name in ("x_m", "y_m"))
-        if not problem and math.isnan(x + y):
-            got = ", ".join(repr(str(values.get(name))[:40]) for name in ("x_m", "y_m"))
-            problem = f"x_m and y_m are not finite numbers: {got}"
+        x, y = (_number(values.get(name)) for name in PLACE[:2])
+        for name, number in zip(PLACE, (x, y), strict=False):
+            if not problem and math.isnan(number):
+                problem = (
+                    f"{name} is not a finite number: {values[name][:40]!r}" if name in values else f"{name} is missing"
+                )
         rows.append(_Row(where, values, Point() if problem else Point(x, y), problem, "bad_value"))
     return rows
 
@@ -411,7 +413,7 @@ def _kind_of(row: _Row, cfg: BoxesConfig) -> str:
         raise _Skipped("unknown_type", f"unknown type {name[:40]!r}{nearest(name, [*TYPES, *cfg.types])}")
     for rule in TYPE_RULES:
         is_meant = any(fnmatchcase(column, pattern) for pattern in rule["column"].split("|"))
-        if is_meant and rule.get("geometry", "") in getattr(row.shape, "geom_type", "Point"):
+        if is_meant and rule.get("geometry", "") in row.shape.geom_type:
             for patterns, kind in rule["kinds"].items():
                 if any(fnmatchcase(name, pattern) for pattern in patterns.split("|")):
                     if kind in TYPES:

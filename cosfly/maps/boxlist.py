@@ -124,20 +124,24 @@ def origin_m(low: np.ndarray, high: np.ndarray, where: str | Path, ground_z_m: f
     return np.array([*np.round((low + high)[:2] / 2), round(float(ground_z_m), 3)])
 
 
-def check_not_empty(box_map: BoxMap, where: str) -> None:
+def check_not_empty(box_map: BoxMap, where: str, fix: str = "") -> None:
     """Raise InputError if a map has no boxes."""
     if not len(box_map):
         got = f"{box_map.header.num_objects} objects, dropped: {counts_text(box_map.header.dropped_objects)}"
         expected = "at least one object with a size"
-        raise InputError("the map has no boxes", where=where, got=got, expected=expected)
+        raise InputError("the map has no boxes", where=where, got=got, expected=expected, fix=fix)
 
 
-def served(box_map: BoxMap, ground_z_m: float | None, where: str) -> BoxMap:
-    """Return the map of a server with a height of its ground, m; None: the median height of its roads."""
-    check_not_empty(box_map, where)
+def served(box_map: BoxMap, ground_z_m: float | None, is_road: np.ndarray, where: str, fix: str) -> BoxMap:
+    """Return the map of a server with a height of its ground, m; None: the median height of its roads.
+
+    Args:
+        is_road: (n,) boxes that are roads of a known size. fix: What to do about a map without boxes.
+    """
+    check_not_empty(box_map, where, fix)
     if dropped := box_map.header.dropped_objects:
         log.warning("%s: dropped objects: %s", where, counts_text(dropped))
-    tops_m = box_map.maxs[box_map.kinds == KINDS["Roads"], 2]
+    tops_m = box_map.maxs[is_road, 2]
     if ground_z_m is None:
         ground_z_m = float(np.median(tops_m)) if len(tops_m) else 0.0
     return replace(box_map, header=box_map.header.model_copy(update={"ground_z_m": ground_z_m}))

@@ -297,10 +297,19 @@ def _raised(surfaces: list[Surface], height_m: float) -> list[Surface]:
 
 def _surfaces(geometry: _Geometry, vertices: np.ndarray, where: str) -> list[Surface]:
     """Return the surfaces of a geometry; for a solid those of its outer shell."""
-    boundaries = validated(BOUNDARIES[geometry.type], geometry.boundaries, where)
+    boundaries = geometry.boundaries
+    if geometry.type == "Solid":
+        boundaries = boundaries[:1]
+    elif geometry.type.endswith("Solid"):
+        boundaries = [shells[:1] if isinstance(shells, list) else shells for shells in boundaries]
+    try:
+        boundaries = validated(BOUNDARIES[geometry.type], boundaries, where)
+    except InputError as error:
+        expected = "nested lists of rings of at least three indices of vertices"
+        raise InputError(error.what, where=error.where, got=error.got, expected=expected, fix=VALIDATE) from error
     if geometry.type.endswith("Solid"):
         solids = [boundaries] if geometry.type == "Solid" else boundaries
-        boundaries = [surface for solid in solids for shell in solid[:1] for surface in shell]
+        boundaries = [surface for solid in solids for shell in solid for surface in shell]
     return [_rings(surface, vertices, f"{where} surface {k}") for k, surface in enumerate(boundaries)]
 
 

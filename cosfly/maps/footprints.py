@@ -156,20 +156,36 @@ def _cut(piece: Polygon, rectangle: Rectangle, shares: Sequence[float]) -> list[
 
 def check_outline(polygon: Polygon, where: str) -> None:
     """Reject an outline with so many crossings that making it valid would take minutes and gigabytes."""
-    if polygon.is_valid:
-        return
-    rings = [shapely.get_coordinates(ring) for ring in shapely.get_rings(polygon)]
-    edges = np.concatenate([np.stack([ring[:-1], ring[1:]], axis=1) for ring in rings])
-    lines = shapely.linestrings(edges[(edges[:, 0] != edges[:, 1]).any(axis=1)])
+    if not polygon.is_valid and num_crossings(polygon) > MOST_CROSSINGS:
+        most = f"{MOST_CROSSINGS:,} crossings"
+        raise over_limit(where, f"an outline with more than {most}", most, "correct the outline")
+
+
+def num_crossings(polygon: Polygon) -> int:
+    """Count the pairs of edges that meet and are not neighbours in a ring; stop soon after MOST_CROSSINGS."""
+    edges: list[np.ndarray] = []
+    neighbours: list[np.ndarray] = []  # the number of the edge before each
+    num_edges = 0
+    for ring in (polygon.exterior, *polygon.interiors):
+        corners = np.asarray(ring.coords)[:, :2]
+        corners = corners[np.r_[True, (np.diff(corners, axis=0) != 0).any(axis=1)]]
+        edges.append(np.stack([corners[:-1], corners[1:]], axis=1))
+        neighbours.append(num_edges + np.roll(np.arange(len(corners) - 1), 1))
+        num_edges += len(corners) - 1
+    if not num_edges:
+        return 0
+    lines = shapely.linestrings(np.concatenate(edges))
+    previous = np.concatenate(neighbours)
     tree = shapely.STRtree(lines)
-    step = max(1, PAIRS_AT_ONCE // max(1, len(lines)))
-    num_pairs = 0  # in both orders; each edge meets itself and its two neighbours
+    count = 0
+    step = max(1, PAIRS_AT_ONCE // len(lines))
     for start in range(0, len(lines), step):
-        part = lines[start : start + step]
-        num_pairs += tree.query(part, predicate="intersects").shape[1] - 3 * len(part)
-        if num_pairs > 2 * MOST_CROSSINGS:
-            most = f"{MOST_CROSSINGS:,} crossings"
-            raise over_limit(where, f"an outline with more than {most}", most, "correct the outline")
+        first, second = tree.query(lines[start : start + step], predicate="intersects")
+        first = first + start
+        count += int(((first < second) & (previous[first] != second) & (previous[second] != first)).sum())
+        if count > MOST_CROSSINGS:
+            break
+    return count
 
 
 def united(polygons: list[Polygon]) -> BaseGeometry:

@@ -136,7 +136,9 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
     boxes = np.reshape(rows, (-1, 9))
     ids = [id_of(name) for name, _, _ in used]
     box_map = make_box_map(boxes[:, :3], boxes[:, 3:6], boxes[:, 6:], kinds, ids, header)
-    return LevelMap(**vars(served(box_map, cfg.ground_z_m, where)), objects=tuple(used))
+    fix = "load another level, or add a table with the sizes of the assets to maps.unrealcv.sizes"
+    box_map = served(box_map, cfg.ground_z_m, np.array(sources) == "road", where, fix)
+    return LevelMap(**vars(box_map), objects=tuple(used))
 
 
 def _unfit(item: _Object, kind: str | None, box: np.ndarray | None, source: str, cfg: UnrealCvMapConfig) -> str:

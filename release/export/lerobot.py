@@ -35,7 +35,7 @@ from cosfly.runtime.png import colours_of
 from release.columns import BOX, CAPTION_FIELDS, POINT, POSE
 from release.export.stage import ExportConfig, ExportSource, FormatFacts, SourceTrack, shards
 from release.reading import Row, vectors
-from release.record import ReleaseRecord
+from release.record import ReleaseRecord, Spread
 
 VERSION = "v3.0"
 CHUNK = 1000  # files of one folder
@@ -244,15 +244,17 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
     table = pd.DataFrame({"task_index": range(len(tasks))}, index=pd.Index(list(tasks), name="task"))
     table.to_parquet(buffer)
     write_bytes(folder / "meta/tasks.parquet", buffer.getvalue())
-    return FormatFacts({"num_episodes": layout.episode, "fps": fps}, split_files={"train": "data/*/*.parquet"})
+    facts = {"num_episodes": layout.episode, "fps": fps, "has_depth": "depth" in source.modalities}
+    return FormatFacts(facts, split_files={"train": "data/*/*.parquet"})
 
 
 def _fps(record: ReleaseRecord) -> int:
     """Return the number of frames per second; it must be whole and the same in all tracks."""
     steps_s = [float(step) for step in record.numbers.of("step_s")]  # rounded: the mean of all is not
-    duration = record.numbers.spreads["track_duration_s"]
+    duration = record.numbers.spreads.get("track_duration_s", Spread())
     num_steps = sum(one.frames_available - 1 for one in record.flights)
-    fps = round(num_steps / (duration.mean * duration.count)) if duration.mean else PAPER_FPS
+    whole_s = (duration.mean or 0.0) * duration.count
+    fps = round(num_steps / whole_s) if whole_s > STEP_TOLERANCE_S else 0 if steps_s else PAPER_FPS
     if any(abs(step - 1 / (fps or 1)) > STEP_TOLERANCE_S for step in steps_s):
         what = "LeRobot needs the same whole number of frames per second in all tracks"
         raise InputError(what, where="time_s", got=f"steps of {', '.join(map(str, sorted(steps_s)[:10]))} s")

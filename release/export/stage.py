@@ -150,7 +150,7 @@ class ExportSource:
         Raises:
             InputError: The shards are not those of a release.
         """
-        known, keys = set[Place](), set[str]()
+        known = set[Place]()
         for shard in sorted(self.record.shards, key=lambda shard: (SPLIT_NAMES.index(shard.split), shard.path)):
             path = self.folder / shard.path
             pictures = read_pictures(self.folder, shard, self.files)
@@ -161,11 +161,10 @@ class ExportSource:
                     what = "the names of the track are not folder names, or it is in two places"
                     raise InputError(what, where=path, got=shown(parts, 200))
                 known.add(place)
-                for name in frames.column("sample_id"):
-                    if not PART.fullmatch(name) or key_of(name) in keys:
-                        what = "the sample_id of a frame is repeated or is not a file name"
-                        raise InputError(what, where=frames.name, got=name)
-                    keys.add(key_of(name))
+                ids = frames.column("sample_id")
+                if not all(map(PART.fullmatch, ids)) or len({*ids}) < len(ids):
+                    what = "the sample_id of a frame is repeated or is not a file name"
+                    raise InputError(what, where=frames.name, got=shown(ids, 200))
                 for name in ("width_px", "height_px"):
                     if len({*frames.column(name)}) > 1:
                         raise InputError("the pictures of the track differ in size", where=frames.name)

@@ -152,9 +152,9 @@ def check_footers(folder: Path, record: ReleaseRecord, good: Sequence[str], find
     """Open every parquet file; return whether all have the columns and number of rows of the release, and each is
     listed once."""
     frames, points = columns.schema(record.settings.modalities), columns.points_schema()
-    num_good = 0
-    for file in (file for file in record.files if file.path in good):
-        wanted = frames if file in record.shards else points
+    num_good, usable, shards = 0, {*good}, {shard.path for shard in record.shards}
+    for file in (file for file in record.files if file.path in usable):
+        wanted = frames if file.path in shards else points
         try:
             with open_table(folder / file.path, tree=folder) as table:
                 schema, num_rows = table.schema_arrow, table.metadata.num_rows
