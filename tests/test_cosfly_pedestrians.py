@@ -293,7 +293,7 @@ def test_nobody_meets_anybody(placed):
         for k, one in enumerate(everybody):
             assert len(one.positions_m) == len(walk.time_s)
             for two in everybody[:k]:
-                assert gaps_m(one, two).min() >= 0.0
+                assert gaps_m(one, [two]).min() >= 0.0
                 apart = np.linalg.norm(one.positions_m - two.positions_m, axis=1).min()
                 assert apart >= 0.6
 

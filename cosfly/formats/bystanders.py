@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +53,7 @@ class Bystander:
         """Middles of the box, (n, 3)."""
         return self.positions_m + np.array([0.0, 0.0, self.build.half_extents_m[2]])
 
-    @property
+    @cached_property
     def discs_m(self) -> np.ndarray:
         """Middles of the discs on the ground, (n, d, 2)."""
         ahead = np.stack([np.cos(self.headings_rad), np.sin(self.headings_rad)], axis=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -53,9 +53,8 @@ class Appearance:
 
     def differences(self, other: Appearance) -> tuple[str, ...]:
         """Return the fields in which two people differ; a garment counts once."""
-        fields = asdict(self)
-        other_fields = asdict(other)
-        differing = {name.removesuffix("_color") for name in fields if fields[name] != other_fields[name]}
+        fields = vars(other)
+        differing = {name.removesuffix("_color") for name, value in vars(self).items() if fields[name] != value}
         return tuple(slot for slot in ("figure", *GARMENTS) if slot in differing)
 
 

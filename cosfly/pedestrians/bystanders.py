@@ -7,7 +7,10 @@ some tries, so there may be fewer than requested.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -55,25 +58,27 @@ class Trip:
     limits_mps: np.ndarray
     head_start_s: float = 0.0
 
-    def moved(self, time_s: np.ndarray, heights: Ground) -> Bystander:
-        """Return the positions and headings at each time."""
-        along_m = self.along_m(time_s)
-        positions_m = self._at(along_m)
+    def moved(self, along_m: np.ndarray, time_s: np.ndarray, heights: Ground) -> Bystander:
+        """Return the positions and headings at distances along the route, (n,) m, which are reached at times (n,)."""
+        positions_m = self.at(along_m)
         if self.kind == "Car":
-            chord = self._at(along_m + CHORD_M) - self._at(along_m - CHORD_M)
+            chord = self.at(along_m + CHORD_M) - self.at(along_m - CHORD_M)
             headings_rad = np.arctan2(chord[:, 1], chord[:, 0])
         else:
             headings_rad = headings_of(positions_m, time_s)
         return Bystander(self.kind, np.column_stack([positions_m, heights.height_at(positions_m)]), headings_rad)
 
-    def along_m(self, time_s: np.ndarray) -> np.ndarray:
-        """Return the distance along the route at each time, (n,) m."""
+    @cached_property
+    def timed(self) -> TimedRoute:
+        """Return the distances along the route as a route of one dimension, with the speeds at its waypoints."""
         speeds_mps = np.where(self.route.stops_s > 0, 0.0, self.limits_mps)
         if self.kind == "Car":
             speeds_mps = braked(speeds_mps, self.route.along_m)
-        line = np.column_stack([self.route.along_m, np.zeros(len(speeds_mps))])
-        positions_m, _ = TimedRoute(line, speeds_mps, self.route.stops_s).sample(time_s + self.head_start_s)
-        return positions_m[:, 0]
+        return TimedRoute(self.route.along_m[:, None], speeds_mps, self.route.stops_s)
+
+    def along_m(self, time_s: np.ndarray) -> np.ndarray:
+        """Return the distance along the route at each time, (n,) m."""
+        return self.timed.sample(time_s + self.head_start_s)[0][:, 0]
 
     def waiting(self, before_m: float) -> Trip:
         """Return the trip with a stop of WAIT_S, or a longer one, at least KEEP_BACK_M before a place of the route."""
@@ -87,20 +92,21 @@ class Trip:
         stops_s[waypoint] += WAIT_S
         return replace(self, route=replace(self.route, stops_s=stops_s))
 
-    def _at(self, along_m: np.ndarray) -> np.ndarray:
+    def at(self, along_m: np.ndarray) -> np.ndarray:
+        """Return the positions at distances along the route, (n, 2) m."""
         route = self.route
         return np.column_stack([np.interp(along_m, route.along_m, route.polyline_m[:, k]) for k in (0, 1)])
 
 
 def braked(limits_mps: np.ndarray, along_m: np.ndarray) -> np.ndarray:
     """Lower speeds at waypoints, (k,), so that accelerations along the route are at most CAR_FORWARD_MPS2."""
-    speeds = limits_mps.copy()
-    gains = 2.0 * CAR_FORWARD_MPS2 * np.diff(along_m)
+    speeds = limits_mps.tolist()  # single numbers of a list are faster than those of an array
+    gains = (2.0 * CAR_FORWARD_MPS2 * np.diff(along_m)).tolist()
     for k in range(len(gains)):
-        speeds[k + 1] = min(speeds[k + 1], np.sqrt(speeds[k] ** 2 + gains[k]))
+        speeds[k + 1] = min(speeds[k + 1], math.sqrt(speeds[k] ** 2 + gains[k]))
     for k in reversed(range(len(gains))):
-        speeds[k] = min(speeds[k], np.sqrt(speeds[k + 1] ** 2 + gains[k]))
-    return speeds
+        speeds[k] = min(speeds[k], math.sqrt(speeds[k + 1] ** 2 + gains[k]))
+    return np.array(speeds)
 
 
 def bystanders_of(
@@ -127,12 +133,12 @@ def bystanders_of(
 def avoid_collisions(trip: Trip, time_s: np.ndarray, placed: list[Bystander], heights: Ground) -> Bystander | None:
     """Return the motion of a trip that waits for those already placed; None where waiting does not help."""
     for _ in range(MOST_WAITS + 1):
-        bystander = trip.moved(time_s, heights)
-        least_gaps_m = np.min([gaps_m(bystander, neighbour) for neighbour in placed], axis=0)
-        collisions = np.flatnonzero(least_gaps_m < 0.0)
+        along_m = trip.along_m(time_s)
+        bystander = trip.moved(along_m, time_s, heights)
+        collisions = np.flatnonzero(gaps_m(bystander, placed) < 0.0)
         if len(collisions) == 0:
             return bystander
-        before_m = float(trip.along_m(time_s[collisions[:1] + 1])[0])
+        before_m = float(along_m[collisions[0] + 1])
         if collisions[0] == 0 and before_m < KEEP_BACK_M[trip.kind]:
             return None
         trip = trip.waiting(before_m)
@@ -150,9 +156,8 @@ def _draw_pedestrian(
     if place is None:
         return None
     reach_cells = cfg.others_reach_m / cfg.resolution_m
-    samples = [ground.sample_goal(place, 0.5 * reach_cells, reach_cells, rng) for _ in range(1 + OPPOSITE_TRIES)]
-    goals = [goal for goal in samples if goal is not None]
-    if len(goals) < 2:
+    goals = ground.sample_goals(place, 0.5 * reach_cells, reach_cells, 1 + OPPOSITE_TRIES, rng)
+    if not goals:
         return None
     first = np.subtract(goals[0], place)
 
@@ -169,7 +174,7 @@ def _draw_pedestrian(
     while trip.along_m(3.0 * target.time_s[-1:])[0] >= trip.route.along_m[-1]:
         trip = _with_return(trip)
     times_s = moment_s + np.arange(0.0, target.time_s[-1], target.time_s[1])
-    apart_m = trip.moved(times_s, ground.heights).positions_m[:, :2] - ground.grid.centers_of(np.array(place))
+    apart_m = trip.at(trip.along_m(times_s)) - ground.grid.centers_of(np.array(place))
     away_m = np.linalg.norm(apart_m, axis=1)
     return replace(trip, head_start_s=float(times_s[np.argmin(away_m)]) - moment_s)
 
@@ -190,10 +195,11 @@ def _draw_car(
 ) -> Trip | None:
     """Draw a car's route that starts nearby and lasts as long, or up to a dead end; None where no lane is near."""
     place_m = target.polyline_m[rng.integers(len(target.polyline_m))]
-    near = [k for k, lane in enumerate(lanes) if lane.distance_m(place_m) < cfg.others_reach_m]
-    if not near:
+    away_m = np.array([lane.distance_m(place_m) for lane in lanes])
+    near = np.flatnonzero(away_m < cfg.others_reach_m)
+    if len(near) == 0:
         return None
-    number = near[rng.integers(len(near))]
+    number = int(near[rng.integers(len(near))])
     begin = int(rng.integers(len(lanes[number].points_m) - 1))
     pieces = [lanes[number].points_m[begin:]]
     length_m = 0.0
@@ -201,7 +207,7 @@ def _draw_car(
     while length_m < needed_m and lanes[number].onward:
         onward = lanes[number].onward
         # Turns prefer lanes near the trajectory, because traffic that leaves the view is of no use.
-        weights = np.exp([-lanes[k].distance_m(place_m) / cfg.others_reach_m for k, _ in onward])
+        weights = np.exp(-away_m[[k for k, _ in onward]] / cfg.others_reach_m)
         number, curve = onward[int(rng.choice(len(onward), p=weights / weights.sum()))]
         pieces += [curve, lanes[number].points_m]
         length_m += len(curve) + len(lanes[number].points_m)  # a metre from point to point
@@ -214,14 +220,18 @@ def _draw_car(
     return Trip("Car", route, limits_mps)
 
 
-def gaps_m(one: Bystander, two: Bystander) -> np.ndarray:
-    """Return the gap between the discs of two bystanders in each time step, (n - 1,) m, negative where they overlap.
+def gaps_m(one: Bystander, others: Sequence[Bystander]) -> np.ndarray:
+    """Return the least gap between the discs of a bystander and of others in each time step, (n - 1,) m.
 
-    Both move straight within a step, so their distance is that of the origin from a segment of offsets.
+    It is negative where they overlap. All move straight within a step, so a distance of two discs is that of the origin
+    from a segment of offsets.
     """
-    apart = one.discs_m[:, :, None] - two.discs_m[:, None]  # (n, d, e, 2)
-    start, along = apart[:-1], np.diff(apart, axis=0)
-    squared = np.maximum((along**2).sum(axis=-1), 1e-12)
-    share = np.clip(-(start * along).sum(axis=-1) / squared, 0.0, 1.0)
-    nearest = np.linalg.norm(start + share[..., None] * along, axis=-1)
-    return nearest.min(axis=(1, 2)) - one.build.disc_radius_m - two.build.disc_radius_m
+    discs_m = np.concatenate([other.discs_m for other in others], axis=1)
+    radii_m = np.repeat([other.build.disc_radius_m for other in others], [other.discs_m.shape[1] for other in others])
+    # Time last: reductions over an axis of two numbers are slow where it is the last.
+    apart = np.ascontiguousarray((one.discs_m[:, :, None] - discs_m[:, None]).T)  # (2, e, d, n)
+    start, along = apart[..., :-1], np.diff(apart)
+    squared = np.maximum((along**2).sum(axis=0), 1e-12)
+    share = np.clip(-(start * along).sum(axis=0) / squared, 0.0, 1.0)
+    nearest = np.linalg.norm(start + share * along, axis=0)
+    return (nearest.min(axis=1) - one.build.disc_radius_m - radii_m[:, None]).min(axis=0)

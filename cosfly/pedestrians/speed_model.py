@@ -41,7 +41,7 @@ def menger_curvature(polyline_m: np.ndarray) -> np.ndarray:
 class TimedRoute:
     """A polyline with a speed and a stop at each waypoint.
 
-    polyline_m: (k, 2) m, k at least 2, no two neighbours equal. speeds_mps: (k,), 0 at stops. stops_s: (k,) duration of
+    polyline_m: (k, d) m, k at least 2, no two neighbours equal. speeds_mps: (k,), 0 at stops. stops_s: (k,) duration of
     the stop, 0 for none.
     """
 
@@ -50,26 +50,30 @@ class TimedRoute:
     stops_s: np.ndarray
 
     @cached_property
+    def lengths_m(self) -> np.ndarray:
+        """Return the lengths of the pieces, (k - 1,) m."""
+        return np.linalg.norm(np.diff(self.polyline_m, axis=0), axis=1)
+
+    @cached_property
     def times_s(self) -> np.ndarray:
         """Return the times at waypoints without stops, (k,) s from 0.
 
         A piece takes its length over the mean of its two speeds.
         """
-        lengths_m = np.linalg.norm(np.diff(self.polyline_m, axis=0), axis=1)
         means_mps = 0.5 * (self.speeds_mps[1:] + self.speeds_mps[:-1])
         if not (means_mps > 0).all():
             k = int(np.argmin(means_mps))
             raise ValueError(f"the pedestrian never leaves waypoint {k}: the speed is 0 at waypoints {k} and {k + 1}")
-        return np.concatenate([[0.0], np.cumsum(lengths_m / means_mps)])
+        return np.concatenate([[0.0], np.cumsum(self.lengths_m / means_mps)])
 
     def resample(self, step_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return times (n,) s at equal steps from 0, positions (n, 2) m and speeds (n,) m/s; the last is the goal."""
+        """Return times (n,) s at equal steps from 0, positions (n, d) m and speeds (n,) m/s; the last is the goal."""
         num_samples = int(np.ceil((self.times_s[-1] + self.stops_s.sum()) / step_s - 1e-9)) + 1
         time_s = np.arange(num_samples) * step_s
         return time_s, *self.sample(time_s)
 
     def sample(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions (n, 2) m and speeds (n,) m/s at times (n,) s; the last waypoint after the end.
+        """Return positions (n, d) m and speeds (n,) m/s at times (n,) s; the last waypoint after the end.
 
         Within a piece the speed changes evenly from one waypoint to the next.
         """
@@ -80,9 +84,9 @@ class TimedRoute:
         elapsed_s = moving_s - times_s[piece]
         from_mps, to_mps = self.speeds_mps[piece], self.speeds_mps[piece + 1]
         moved_m = from_mps * elapsed_s + 0.5 * (to_mps - from_mps) / duration_s * elapsed_s**2
-        chord_m = self.polyline_m[piece + 1] - self.polyline_m[piece]
-        share = np.clip(moved_m / np.linalg.norm(chord_m, axis=1), 0.0, 1.0)
-        positions_m = self.polyline_m[piece] + share[:, None] * chord_m
+        share = np.clip(moved_m / self.lengths_m[piece], 0.0, 1.0)
+        start_m = self.polyline_m[piece]
+        positions_m = start_m + share[:, None] * (self.polyline_m[piece + 1] - start_m)
         return positions_m, from_mps + (to_mps - from_mps) * elapsed_s / duration_s
 
 

@@ -179,9 +179,15 @@ class WalkableGround:
     def sample_goal(
         self, start: tuple[int, int], min_cells: float, max_cells: float, rng: np.random.Generator
     ) -> tuple[int, int] | None:
-        """Draw one cell of `may_end` in the start's part, (x index, y index), uniformly; None if there is none.
+        """Draw one cell as `sample_goals`; None if there is none."""
+        return next(iter(self.sample_goals(start, min_cells, max_cells, 1, rng)), None)
 
-        min_cells, max_cells: bounds of its straight distance from the start, both included.
+    def sample_goals(
+        self, start: tuple[int, int], min_cells: float, max_cells: float, num: int, rng: np.random.Generator
+    ) -> list[tuple[int, int]]:
+        """Draw cells of `may_end` in the start's part, (x index, y index), uniformly; none if there are none.
+
+        min_cells, max_cells: bounds of their straight distance from the start, both included.
         """
         x, y = start
         reach = int(max_cells)
@@ -193,9 +199,9 @@ class WalkableGround:
         fits = (window == self.parts[y, x]) & self.may_end[near]
         candidates = np.flatnonzero(fits & (squared >= min_cells**2) & (squared <= max_cells**2))
         if len(candidates) == 0:
-            return None
-        row, column = divmod(int(candidates[rng.integers(len(candidates))]), window.shape[1])
-        return column + first_x, row + first_y
+            return []
+        drawn = (divmod(int(candidates[rng.integers(len(candidates))]), window.shape[1]) for _ in range(num))
+        return [(column + first_x, row + first_y) for row, column in drawn]
 
     def route(self, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
         """Return the cells of a cheapest route between two cells of one part, (k, 2)."""
