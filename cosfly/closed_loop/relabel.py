@@ -2,13 +2,12 @@
 student was.
 
 The planner knows the whole pedestrian trajectory. It plans from the pose and velocity that the student had reached, and
-`PlannerEngine` flies that plan. A decision is a mistake if its motion rules it out, or if the student was about to lose
-the target. Each decision gives a short trajectory: the student's observed frames, then the planner's, with captions.
+`PlannerEngine` flies that plan. Each decision gives a short trajectory: the student's observed frames, then the
+planner's, with captions.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,15 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from caption.schema import FutureMotion
 from caption.stage import stage as captioning
-from caption.verification.actions import TABLE, measure
 from cosfly.closed_loop.engines import PlannerEngine
-from cosfly.closed_loop.measures import LOSS_S
 from cosfly.closed_loop.stage import PLAN, TRACES, TREE, ClosedLoopConfig, flown_trace
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, as_drawn
 from cosfly.formats.boxes import read_boxes
-from cosfly.formats.episodes import Episode, EpisodeFrame, episode_file, read_episode, read_score
+from cosfly.formats.episodes import EpisodeFrame, episode_file, read_episode, read_score
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
 from cosfly.geometry.axes import look_at, step_s
 from cosfly.geometry.kernels import signed_distances, swept_distances
@@ -66,11 +62,9 @@ def run(
             decisions = range(record.num_lead, len(record.frames) - 1, cfg.fly.relabel.stride)
             items += [Item(f"{episode}_f{i:05d}", (episode, i)) for i in decisions]
         done = run_items(stage, items, make_worker, (cfg, flown, boxes, simplified, seed), workers=workers, watch=watch)
-        results = [outcome.result for outcome in done.kept]
-        traces = [DroneTrace.from_json(result["trace"], "relabel") for result in results]
-        reasons = Counter(reason for result in results for reason in result["reasons"])
+        traces = [DroneTrace.from_json(outcome.result["trace"], "relabel") for outcome in done.kept]
         write_traces(stage.path / TRACES, traces, {"round": cfg.fly.relabel.round, "seed": seed})
-        stage.finish([stage.path / TRACES], done.tally, reasons=dict(sorted(reasons.items())))
+        stage.finish([stage.path / TRACES], done.tally)
     common: dict[str, Any] = {"seed": seed, "workers": workers, "watch": watch, "resume": resume}
     rendering.run(as_drawn(cfg.render, seed), boxes, simplified, out / TRACES, out / TREE, **common)
     captioning.run(cfg.caption, out / TREE, out / CAPTIONS, **common)
@@ -136,24 +130,17 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
             advance()
         if simulation.ended != "finished":
             return Outcome(drop_reason="crashes")
-        before, *after = moments[window.num_frames - 2 :][: window.future_frames + 2]
-        rows = [(m.time_s, m.position_m, m.rotation_deg[1], m.target_m, m.target.visible) for m in after]
-        speed_mps = float(np.linalg.norm(after[0].position_m - before.position_m)) / simulation.dt_s
-        time_s, positions_m, yaw_deg, targets_m, visible = map(np.array, zip(*rows, strict=True))
-        indices = tuple(moment.index for moment in after[1:])
-        future = FutureMotion(indices, time_s, positions_m, yaw_deg, targets_m, visible, speed_mps)
-        reasons = _reasons(record, i, future)
         poses = simulation.poses
-        source = {"student": record.student, "round": relabel.round}
         trace = flown_trace(
             airspace.surroundings.obstacles, np.array([moment.time_s for moment in moments]),
             np.hstack([poses.positions_m, poses.rotations_deg]), poses.targets_m, poses.clearances_m,
             np.array([moment.position_m[2] - moment.height_m for moment in moments]), path_id=item.item_id,
             planner=f"replanned from frame {i} of {record.student}, round {relabel.round}", pace=record.style.pace,
-            solver={"source": episode, "frame": i, **source, "decision": record.frames[i].action, "reasons": reasons},
+            solver={"source": episode, "frame": i, "student": record.student, "round": relabel.round,
+                    "decision": record.frames[i].action},
             part_of=planned.part_of,
         )  # fmt: skip
-        return Outcome({"trace": trace.as_json(), "reasons": reasons})
+        return Outcome({"trace": trace.as_json()})
 
     return work
 
@@ -169,16 +156,3 @@ def _planned_on(plan: DroneTrace, flown: Sequence[EpisodeFrame], airspace: Airsp
     clearances_m = swept_distances(obstacles, positions_m, CLEARANCE_CAP_M)[0]
     clearances_m[: len(poses)] = [frame.clearance_m for frame in flown]
     return replace(plan, positions_m=positions_m, rotations_deg=rotations_deg, clearances_m=clearances_m)
-
-
-def _reasons(record: Episode, i: int, future: FutureMotion) -> list[str]:
-    """Return the reasons why the decision at frame i is a mistake; none if it is not."""
-    reasons = []
-    next_frames = record.frames[i : i + round(LOSS_S / record.dt_s) + 1]
-    if not all(frame.visible for frame in next_frames):
-        reasons.append("nearly_lost")
-    action = record.frames[i].action
-    motion = measure(future)
-    if action in TABLE.contradicted_by(motion, TABLE.label_of(motion)):
-        reasons.append("hard_conflict")
-    return reasons

@@ -10,7 +10,7 @@ import logging
 import math
 import os
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -57,6 +57,7 @@ from distill.inference.stage import InferConfig
 
 log = logging.getLogger(__name__)
 
+EpisodeOpener = Callable[[Any], ClosedLoopTrajectory]
 PLAN, TRACES, TREE, ANSWERS = "plan", "drone_trace.json", "render", "answers"
 MOST_HANGS = 2  # workers that a policy may hang, in addition to one per finished item
 STEP_S = 60.0  # for drawing a step, and for opening an episode
@@ -128,52 +129,13 @@ class OpenEpisode:
         camera = simulation.script.cameras[0]
         self.note(last, EngineDecision("end"), None, last.clearance_m)
         return Episode(
-            **shared, episode=self.episode, town=simulation.airspace.town, walk=plan.path_id,
+            **shared, episode=self.episode, town=simulation.airspace.town, map_sha256=simulation.airspace.map_sha256,
+            walk=plan.path_id,
             style=difficulty_of(plan, simulation.num_lead - 1, simulation.airspace.surroundings.obstacles),
             dt_s=simulation.dt_s, camera_px=(camera.width_px, camera.height_px), fov_deg=camera.fov_deg,
             drone_radius_m=simulation.drone.radius_m, ended=simulation.ended, frames=tuple(self.frames),
             num_walk_frames=len(plan.time_s) - simulation.num_lead,
         )  # fmt: skip
-
-
-class EpisodeRunner:
-    """The engine of this process, which flies several episodes at once. Created before a renderer is opened."""
-
-    def __init__(
-        self, cfg: ClosedLoopConfig, out: Path, seed: int, num_workers: int, list_sha256: str | None = None
-    ) -> None:
-        os.environ.setdefault("LP_NUM_THREADS", str(max(1, num_cpus() // num_workers)))
-        self.out = out
-        self.engine = open_engine(cfg.fly, cfg.caption, cfg.infer, seed, out / ANSWERS)
-        self.controls = read_controls(cfg.fly.table, TOKENS)
-        self.shared = {  # fields of every record
-            "student": self.engine.name, "engine": cfg.fly.engine, "seed": seed, "list_sha256": list_sha256,
-            "controller_sha256": None if cfg.fly.engine == "planner" else sha256_file(cfg.fly.table),
-        }  # fmt: skip
-
-    def fly(self, episodes: Mapping[str, Callable[[], ClosedLoopTrajectory]], maps: Mapping[str, str]) -> Outcome:
-        """Fly episodes to their ends and write each record; episodes with a record are skipped.
-
-        Args:
-            episodes: name -> function that opens the episode. maps: name -> sha256 of its map.
-        """
-        active = [
-            OpenEpisode(name, open_simulation(), self.controls, self.engine.num_frames)
-            for name, open_simulation in episodes.items()
-            if not episode_file(self.out, name).exists()
-        ]
-        while active:
-            observations = [
-                Observation(episode.episode, episode.simulation, tuple(episode.moments)) for episode in active
-            ]
-            for episode, decision in zip(active, self.engine.decide(observations), strict=True):
-                episode.step(decision)
-                advance()
-            for episode in [episode for episode in active if episode.simulation.ended is not None]:
-                shared = self.shared | {"map_sha256": maps[episode.episode]}
-                write_episode(episode_file(self.out, episode.episode), episode.record(shared))
-                active.remove(episode)
-        return Outcome({"flights": list(episodes)})
 
 
 def run(
@@ -200,7 +162,6 @@ def run(
     if not stage.is_complete:
         plans = planning.run(cfg.plan, simplified, paths, out / PLAN, **common)
         num_workers = 1 if cfg.fly.asks_model else workers
-        worker_args = (cfg, (boxes, simplified, plans, others), stage.path, seed, num_workers)
         traces = read_traces(plans)
         reasons = [_drop_reason(trace, cfg.fly) for trace in traces]
         flown = [n for n, reason in enumerate(reasons) if reason is None]
@@ -209,18 +170,71 @@ def run(
             expected = f"at least one accepted trajectory of more than {cfg.fly.lead_frames} frames (fly.lead_frames)"
             raise stage.nothing_kept(Tally(input=len(traces), dropped=dropped), expected=expected)
         ordered = sorted(flown, key=lambda n: (Airspace.area_of(traces[n].targets_m), n))
-        batch_size = min(cfg.fly.batch, math.ceil(len(flown) / num_workers))
-        items = []
-        for start in range(0, len(ordered), batch_size):
-            batch = ordered[start : start + batch_size]
-            steps = sum(len(_cut(traces[n], cfg.fly).time_s) - cfg.fly.lead_frames for n in batch)
-            items.append(Item(f"{traces[batch[0]].path_id} and {len(batch) - 1}", batch, steps))
-        run_items(stage, items, make_worker, worker_args, workers=num_workers, watch=watch_of(cfg.fly, watch))
+        episodes = [(traces[n].path_id, n, len(_cut(traces[n], cfg.fly).time_s) - cfg.fly.lead_frames) for n in ordered]
+        batch = min(cfg.fly.batch, math.ceil(len(flown) / num_workers))
+        start = partial(open_map, cfg, seed, boxes, simplified, plans, others)
+        fly_episodes(stage, cfg, [episodes], batch, start, seed, num_workers, watch)
         names = [traces[n].path_id for n in flown]
         finish_episodes(stage, cfg.fly, seed, names, dropped, obstacle_index(read_boxes(simplified)))
     if cfg.fly.tree:
         rendering.run(as_drawn(cfg.render, seed), boxes, simplified, out / TRACES, out / TREE, others=others, **common)
     return out
+
+
+def fly_episodes(
+    stage: StageFolder, cfg: ClosedLoopConfig, groups: Sequence[Sequence[tuple[str, Any, int]]], batch: int,
+    start: Callable[[], EpisodeOpener], seed: int, num_workers: int, watch: Watch, list_sha256: str | None = None,
+) -> None:  # fmt: skip
+    """Fly episodes to their ends and write each record; episodes with a record are skipped.
+
+    Args:
+        groups: Episodes that may be in one batch, each as its id, the argument that opens it, and its number of steps.
+        batch: Number of episodes that a worker flies at once.
+        start: A partial of a module-level function, which a worker calls once to get what opens an episode.
+    """
+    items = []
+    for group in groups:
+        for begin in range(0, len(group), batch):
+            names, arguments, steps = zip(*group[begin : begin + batch], strict=True)
+            payload = dict(zip(names, arguments, strict=True))
+            items.append(Item(f"{names[0]} and {len(names) - 1}", payload, sum(steps)))
+    worker_args = (cfg, start, stage.path, seed, num_workers, list_sha256)
+    run_items(stage, items, make_worker, worker_args, workers=num_workers, watch=watch_of(cfg.fly, watch))
+
+
+def make_worker(
+    cfg: ClosedLoopConfig, start: Callable[[], EpisodeOpener], out: Path, seed: int, num_workers: int,
+    list_sha256: str | None,
+) -> Work:  # fmt: skip
+    """Open an engine in this process, then a renderer; return the function that flies the episodes of an item."""
+    os.environ.setdefault("LP_NUM_THREADS", str(max(1, num_cpus() // num_workers)))
+    engine = open_engine(cfg.fly, cfg.caption, cfg.infer, seed, out / ANSWERS)
+    controls = read_controls(cfg.fly.table, TOKENS)
+    shared = {  # fields of every record
+        "student": engine.name, "engine": cfg.fly.engine, "seed": seed, "list_sha256": list_sha256,
+        "controller_sha256": None if cfg.fly.engine == "planner" else sha256_file(cfg.fly.table),
+    }  # fmt: skip
+    open_episode = start()
+
+    def work(item: Item) -> Outcome:
+        active = [
+            OpenEpisode(name, open_episode(argument), controls, engine.num_frames)
+            for name, argument in item.payload.items()
+            if not episode_file(out, name).exists()
+        ]
+        while active:
+            observations = [
+                Observation(episode.episode, episode.simulation, tuple(episode.moments)) for episode in active
+            ]
+            for episode, decision in zip(active, engine.decide(observations), strict=True):
+                episode.step(decision)
+                advance()
+            for episode in [episode for episode in active if episode.simulation.ended is not None]:
+                write_episode(episode_file(out, episode.episode), episode.record(shared))
+                active.remove(episode)
+        return Outcome({"flights": list(item.payload)})
+
+    return work
 
 
 def watch_of(fly: FlyConfig, watch: Watch) -> Watch:
@@ -259,32 +273,23 @@ def finish_episodes(
     )  # fmt: skip
 
 
-def make_worker(
-    cfg: ClosedLoopConfig, inputs: tuple[Path, Path, Path, Path | None], out: Path, seed: int, num_workers: int
-) -> Work:
-    """Open a renderer and an engine in this process; return the function that flies the episodes of an item."""
-    boxes, simplified, plans, others = inputs
-    runner = EpisodeRunner(cfg, out, seed, num_workers)
+def open_map(
+    cfg: ClosedLoopConfig, seed: int, boxes: Path, simplified: Path, plans: Path, others: Path | None
+) -> EpisodeOpener:
+    """Open a renderer of a map in this process; return the function that opens the episode of a plan's index."""
     traces = read_traces(plans)
     bystanders, num_others = rendering.bystanders_of(others, traces)
-    map_sha256 = sha256_file(boxes)
-    airspace = Airspace(cfg.render, read_boxes(boxes), read_boxes(simplified), seed=seed, num_others=num_others)
+    drawn, obstacles = read_boxes(boxes), read_boxes(simplified)
+    airspace = Airspace(cfg.render, drawn, obstacles, map_sha256=sha256_file(boxes), seed=seed, num_others=num_others)
 
-    def open_simulation(n: int) -> ClosedLoopTrajectory:
+    def open_episode(n: int) -> ClosedLoopTrajectory:
+        plan, fly = traces[n], cfg.fly
+        other = bystanders.get(plan.path_id, ())
         return ClosedLoopTrajectory(
-            airspace,
-            _cut(traces[n], cfg.fly),
-            number=n,
-            num_lead=cfg.fly.lead_frames,
-            lost_s=cfg.fly.lost_s,
-            others=bystanders.get(traces[n].path_id, ()),
+            airspace, _cut(plan, fly), number=n, num_lead=fly.lead_frames, lost_s=fly.lost_s, others=other
         )
 
-    def work(item: Item) -> Outcome:
-        episodes = {traces[n].path_id: partial(open_simulation, n) for n in item.payload}
-        return runner.fly(episodes, dict.fromkeys(episodes, map_sha256))
-
-    return work
+    return open_episode
 
 
 def _drop_reason(trace: DroneTrace, cfg: FlyConfig) -> str | None:

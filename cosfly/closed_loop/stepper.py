@@ -46,17 +46,19 @@ class Airspace:
     """A map with its renderer and obstacles. One per process, used from one thread."""
 
     def __init__(
-        self, cfg: RenderConfig, boxes: BoxMap, simplified: BoxMap, *, seed: int = 0, num_others: int = 0,
-        like: Airspace | None = None,
+        self, cfg: RenderConfig, boxes: BoxMap, simplified: BoxMap, *, map_sha256: str = "", seed: int = 0,
+        num_others: int = 0, like: Airspace | None = None,
     ) -> None:  # fmt: skip
         """
         Args:
             boxes: The map that is drawn.
             simplified: The map whose boxes are obstacles.
+            map_sha256: Digest of the map in records.
             num_others: Number of ids that the bystanders of an episode need at most.
             like: One of another map with the same settings, whose renderer's device is shared.
         """
         self.cfg = as_drawn(cfg, seed).model_copy(update={"first_timestamp": cfg.first_timestamp or 0})
+        self.map_sha256 = map_sha256
         self.seed = seed
         self.renderer: Renderer = renderer_of(cfg, boxes, num_others, None if like is None else like.renderer)
         self.pools = read_pools(cfg)

@@ -130,7 +130,10 @@ class BenchmarkWorld:
         """Open a renderer for a task; like: another town of this task and size, which shares its GL context."""
         num_others = TASKS[task].others + TASKS[task].traffic
         cfg = RenderConfig(width_px=size_px[0], height_px=size_px[1], fovs_deg=(FOV_DEG,))
-        return Airspace(cfg, self.boxes, self.simplified, seed=self.town.seed, num_others=num_others, like=like)
+        return Airspace(
+            cfg, self.boxes, self.simplified, map_sha256=self.sha256, seed=self.town.seed, num_others=num_others,
+            like=like,
+        )  # fmt: skip
 
 
 @lru_cache(maxsize=len(HELD_OUT) + len(TRAINING))
@@ -166,14 +169,13 @@ class BenchmarkEpisode:
         return ClosedLoopTrajectory(airspace, self.plan, number=self.number, num_lead=self.num_lead, others=self.others)
 
 
-def hardest_begin(plan: DroneTrace, solids: BoxIndex) -> tuple[int, float]:
-    """Return where an episode begins: a drone that hovers after the lead frames sees the target in the fewest frames.
+def hardest_begin(plan: DroneTrace, solids: BoxIndex) -> int:
+    """Return the point of the plan where an episode begins.
 
-    Returns:
-        A point of the plan, and that share of the episode's frames.
+    A drone that hovers after the lead frames sees the target in the fewest frames.
     """
     intrinsic = intrinsic_matrix(*SIZE_PX, FOV_DEG)
-    found = 0, 1.0
+    hardest, least = 0, 1.0
     for begin in range(0, len(plan.time_s) - LEAD_FRAMES - NUM_DECISIONS + 1, EACH):
         now = begin + LEAD_FRAMES - 1
         frames = np.arange(now, now + NUM_DECISIONS + 1, EACH)
@@ -182,9 +184,9 @@ def hardest_begin(plan: DroneTrace, solids: BoxIndex) -> tuple[int, float]:
         targets_m = plan.targets_m[frames[((pixels >= 0) & (pixels < SIZE_PX)).all(axis=1)]]
         seen = visibility(solids, np.broadcast_to(camera_m, targets_m.shape), targets_m) > 0.0
         share = np.count_nonzero(seen) / len(frames)
-        if plan.visibility[now] >= 0.5 and share < found[1]:
-            found = begin, share
-    return found
+        if plan.visibility[now] >= 0.5 and share < least:
+            hardest, least = begin, share
+    return hardest
 
 
 @lru_cache(maxsize=256)
@@ -213,7 +215,7 @@ def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisod
         else:
             rotations_deg[:num_lead, 1] += float(rng_for(town.seed, "reacquire", name).uniform(*TURNED_DEG))
     else:
-        begin = hardest_begin(plan, world.solids)[0]
+        begin = hardest_begin(plan, world.solids)
     if len(plan.time_s) < (end := begin + num_lead + NUM_DECISIONS):
         return None
     plan = replace(plan.part(number, begin, end), rotations_deg=rotations_deg[begin:end])
