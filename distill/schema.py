@@ -112,18 +112,18 @@ def read_training_set(dataset: Path) -> TrainingSet:
 
 def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
     """Return which of the given playback trees belongs to which run of a training set: run -> tree."""
-    wanted = {tree.sha256: tree.run for tree in read_training_set(dataset).trees}
+    wanted = {tree.run: tree.sha256 for tree in read_training_set(dataset).trees}  # two runs may have equal trees
     found = {fingerprint(path): path for path in data if wanted}  # none for a set without pictures
     for digest, path in found.items():
-        if digest not in wanted:
+        if digest not in wanted.values():
             what = "the training set was not made of this playback tree"
-            expected = ", ".join(f"{run}: {sha256}" for sha256, run in wanted.items())
+            expected = ", ".join(f"{run}: {sha256}" for run, sha256 in wanted.items())
             fix = "pass the unchanged trees of the training set, or prepare a training set from this tree"
             raise InputError(what, where=path, got=digest, expected=expected, fix=fix)
-    if missing := [run for digest, run in wanted.items() if digest not in found]:
+    if missing := [run for run, digest in wanted.items() if digest not in found]:
         what, fix = "a playback tree of the training set is missing", "pass --data once for each of its trees"
         raise InputError(what, where=dataset, expected=f"--data also for the runs {', '.join(missing)}", fix=fix)
-    return {run: found[digest] for digest, run in wanted.items()}
+    return {run: found[digest] for run, digest in wanted.items()}
 
 
 def tree_inputs(trees: Collection[Path], captions: Collection[Path] = ()) -> dict[str, Path]:

@@ -39,17 +39,15 @@ from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, read_mani
 from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
 from distill.student.chat import EncodedSample, prompt_batch
 from distill.student.features import PictureReader, Tensors, pictures_of, read_features, shown
-from distill.student.model import Device, Student, load_student, student_path, weight_files
+from distill.student.model import Device, Student, load_student, require, student_path, weight_files
 from distill.student.saving import check_adapter
 
 log = logging.getLogger(__name__)
 
-# Samples taken at once, times those in flight: few are waited for at the end, when the rest has an answer.
-WAITING = 16
-
-
 STAGE = "distill.infer"
 ANSWERS = "answers"  # the folder of journals
+# Samples taken at once, times those in flight: few are waited for at the end, when the rest has an answer.
+WAITING = 16
 
 
 class InferConfig(Config):
@@ -131,7 +129,7 @@ def make_prediction(
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a run reads. model: a folder, or the URL of a server, or of several with commas between."""
+    """What a run reads. model: a folder, or the URL of a server."""
 
     samples: Sequence[Sample]
     trees: Mapping[str, Path]
@@ -345,10 +343,13 @@ def _with_model_name(cfg: InferConfig, url: str, out: Path) -> InferConfig:
         async with started(client):
             return client.model
 
-    if (out / "manifest.json").is_file() and not read_manifest(out).counts.failed:
-        name = cfg.endpoint.model or read_stage_record(out).config.get("endpoint", {}).get("model")
-    else:
-        name = asyncio.run(ask())
+    is_complete = (out / "manifest.json").is_file() and not read_manifest(out).counts.failed
+    try:
+        name = cfg.endpoint.model if is_complete and cfg.endpoint.model else asyncio.run(ask())
+    except TeacherError:
+        if not is_complete:
+            raise
+        name = read_stage_record(out).config.get("endpoint", {}).get("model")
     return cfg.model_copy(update={"endpoint": cfg.endpoint.model_copy(update={"model": name})})
 
 
@@ -378,6 +379,8 @@ def run(
         ConfigError: the engine takes no adapter, or the memory is full.
         TeacherError: the engine does not answer. NothingKept: no sample was answered.
     """
+    if cfg.engine == "transformers":
+        require("torch", "transformers", "peft")
     trees = resolve_trees(dataset, data)
     files: dict[str, Path] = {"dataset": dataset, **tree_inputs(trees.values())}
     if adapter is not None and cfg.engine != "transformers":

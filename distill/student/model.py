@@ -142,11 +142,17 @@ def compute_dtype(wanted: Dtype, device: str) -> Any:
 @contextlib.contextmanager
 def loading_errors(what: str, where: Path) -> Iterator[None]:
     """Convert what transformers, peft, gguf and safetensors raise about a file into one line."""
+    from safetensors import SafetensorError
+
     try:
         yield
     except CosflyError:
         raise
-    except Exception as error:  # tokenizers raises this class itself
+    except Exception as error:
+        # tokenizers raises the class Exception itself; others would be errors of ours.
+        known = (ImportError, LookupError, OSError, RuntimeError, TypeError, ValueError, SafetensorError)
+        if not isinstance(error, known) and type(error) is not Exception:
+            raise
         got = " ".join(str(error).split())[:300] or type(error).__name__
         fix = "update transformers, or use another student"
         if "trust_remote_code" in str(error):
@@ -209,6 +215,7 @@ def load_student(
     weight_files(path)
     import torch
     from peft import PeftModel
+    from safetensors import safe_open
     from transformers import AutoConfig, AutoModelForCausalLM, AutoModelForImageTextToText, AutoTokenizer
     from transformers.models.auto.modeling_auto import MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING
 
@@ -243,7 +250,7 @@ def load_student(
     with loading_errors("student", adapter or path):
         model, info = auto_class.from_pretrained(**arguments, **dtypes, output_loading_info=True)
         if missing := sorted(info["missing_keys"]):  # the library would draw them at random
-            got, fix = f"no {missing[0]} and {len(missing) - 1} others", "download the whole model"
+            got, fix = f"no {', '.join(missing[:3])} ({len(missing)} missing)", "download the whole model"
             raise InputError("the student has no weights for some of its layers", where=path, got=got, fix=fix)
         if path.suffix == GGUF:  # the weights are plain numbers now, which can be saved
             model.config.__dict__.pop("quantization_config", None)
@@ -251,9 +258,15 @@ def load_student(
         if adapter is not None:
             if not (adapter / "adapter_model.safetensors").is_file():
                 raise InputError("the folder is not an adapter", where=adapter, expected="adapter_model.safetensors")
-            with warnings.catch_warnings():
-                warnings.filterwarnings("error", message=".*missing adapter keys")  # which stay at zero
-                model = PeftModel.from_pretrained(model, adapter)
+            model = PeftModel.from_pretrained(model, adapter)
+            with safe_open(adapter / "adapter_model.safetensors", framework="pt") as file:
+                num_found = len(list(file.keys()))
+            # The library leaves a missing tensor at zero, and ignores one too many, without an error.
+            num_wanted = sum("lora_" in name for name, _ in model.named_parameters())
+            if num_found != num_wanted:
+                got, fix = f"{num_found} tensors", "pass the base model of this adapter, or the whole adapter"
+                words = "the adapter does not fit the model"
+                raise InputError(words, where=adapter, got=got, expected=str(num_wanted), fix=fix)
     model.to(device_name)
     if is_fast and device_name == "cuda":
         qwen3_5.fuse_norms(model)

@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 
 ADAPTER, MODEL, STUDENT = "adapter", "model", "student"
 TOKENIZER_SAMPLES = 2000  # most samples that the tokenizer of a random student is trained on
-PATIENCE = timedelta(minutes=30)  # for the slowest process: loading weights, counting tokens, validation
+PATIENCE = timedelta(minutes=30)  # for the slowest process: loading weights, encoding texts, validation
 
 
 def taught_by(samples: Sequence[Sample], max_pixels: int) -> ChatFormat:
