@@ -156,7 +156,7 @@ def test_facts_of_a_hand_made_window(tree):
     assert "Turn: left 2.0 deg/s, left 4.0 deg since the first frame" in prompt
     assert "visible, visible, partly occluded, occluded, out of view\n" in prompt
     chinese = make_question(window, ImageConfig(), "prose", VOCABULARY).prompts["zh"].user
-    assert "可见, 可见, 部分遮挡, 被遮挡, 在视野外\n" in chinese
+    assert "可见, 可见, 被部分遮挡, 被遮挡, 处于视野外\n" in chinese
     assert "5 frames, 0.5 s apart," in prompt
     # Who is not hidden and cannot be made out is told as that; a tree that does not say so changes nothing.
     dim = dataclasses.replace(window, frames=tuple(dataclasses.replace(f, legible=False) for f in window.frames))
@@ -164,7 +164,7 @@ def test_facts_of_a_hand_made_window(tree):
     assert measure_facts(dim) == dataclasses.replace(facts, visibility=words)
     told = make_question(dim, ImageConfig(), "prose", VOCABULARY).prompts
     assert "hard to make out, hard to make out, hard to make out, occluded, out of view\n" in told["en"].user
-    assert "难以辨认, 难以辨认, 难以辨认, 被遮挡, 在视野外\n" in told["zh"].user
+    assert "难以辨认, 难以辨认, 难以辨认, 被遮挡, 处于视野外\n" in told["zh"].user
     frames = tuple(dataclasses.replace(frame, time_s=0.5 * frame.time_s) for frame in window.frames)
     halved = dataclasses.replace(window, frames=frames)
     doubled = make_question(halved, ImageConfig(), "prose", VOCABULARY).prompts
