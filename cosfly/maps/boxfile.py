@@ -398,6 +398,9 @@ def _feature(item: Any, number: int) -> _Row:
 def _unknown(names: Sequence[str], cfg: BoxesConfig) -> list[str]:
     if "*" in cfg.ignore or not cfg.is_plain:
         return []
+    if tags := [tag for tag in ("building", "highway", "natural", "class") if tag in names]:
+        fix = f"set maps.boxes.type_column={','.join(tags)}"
+        return [f"the properties look like those of OpenStreetMap or Overture; {fix}"]
     accepted = {*COLUMNS, *cfg.ignore}
     return [f"unknown column {name!r}{nearest(name, COLUMNS)}" for name in names if name not in accepted]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hmac
 import json
 import logging
@@ -41,9 +42,10 @@ class PageServer:
         self.address = f"http://{self.host}/{self.token}/"
 
     def serve(self) -> None:
-        """Answer requests until an interrupt."""
+        """Answer requests until an interrupt, which is how a user ends it."""
         try:
-            self.http.serve_forever()
+            with contextlib.suppress(KeyboardInterrupt):
+                self.http.serve_forever()
         finally:
             self.http.server_close()
 
