@@ -208,8 +208,7 @@ def load_student(
     require("torch", "transformers", "peft")
     weight_files(path)
     import torch
-    from peft import PeftModel
-    from safetensors import safe_open
+    from peft import PeftModel, load_peft_weights
     from transformers import AutoConfig, AutoModelForCausalLM, AutoModelForImageTextToText, AutoTokenizer
     from transformers.models.auto.modeling_auto import MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING
 
@@ -253,14 +252,12 @@ def load_student(
             if not (adapter / "adapter_model.safetensors").is_file():
                 raise InputError("the folder is not an adapter", where=adapter, expected="adapter_model.safetensors")
             model = PeftModel.from_pretrained(model, adapter)
-            with safe_open(adapter / "adapter_model.safetensors", framework="pt") as file:
-                num_found = len(list(file.keys()))
-            # The library leaves a missing tensor at zero, and ignores one too many, without an error.
+            num_found = len(load_peft_weights(str(adapter), device="cpu"))
             num_wanted = sum("lora_" in name for name, _ in model.named_parameters())
-            if num_found != num_wanted:
+            if num_found != num_wanted:  # the library leaves a missing tensor at zero, and ignores one too many
                 got, fix = f"{num_found} tensors", "pass the base model of this adapter, or the whole adapter"
-                words = "the adapter does not fit the model"
-                raise InputError(words, where=adapter, got=got, expected=str(num_wanted), fix=fix)
+                words, expected = "the adapter does not fit the model", str(num_wanted)
+                raise InputError(words, where=adapter, got=got, expected=expected, fix=fix)
     model.to(device_name)
     if is_fast and device_name == "cuda":
         qwen3_5.fuse_norms(model)
