@@ -111,6 +111,8 @@ WINDOW_FAULTS = {
         "is loaded with context length of only 4096 tokens.", "refused_too_long"),
     "filtered": (400, FILTERED, "refused_content"),
     "flagged": (403, "Your chosen model requires moderation and your input was flagged.", "refused_content"),
+    "filtered, with the request": (400, "The request was blocked: response_format=json_schema, messages=...",
+        "refused_schema"),
     "a picture": (400, "cannot identify image file <_io.BytesIO object at 0x7f2a>", "refused_400"),
     "words that nobody knows": (400, NOT_KNOWN, "refused_400"),
     "markup and escapes": (400, '[bold]\x1b[31m<script>alert("x")</script>\nnext\x00line[/] %s {0}', "refused_400"),

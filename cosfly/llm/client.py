@@ -228,14 +228,15 @@ class ChatClient:
             TimeoutError, httpx.TimeoutException: The response was not complete in time.
             httpx.RequestError: The connection failed, or the body is compressed.
         """
+        refused: dict[Kind, Refusal] = {}  # of this request; a filter that echoes it may read as a refused schema
         while True:
-            left_out = set(self.left_out)  # requests in flight at the first refusal are refused, too
+            left_out = self.left_out | refused
             with_schema = self.cfg.json_schema and bool(request.schema) and "schema" not in left_out
             with_system = "no_system" not in left_out
             body = protocol.request_body(self.model, request, with_schema=with_schema, with_system=with_system)
             response = await self._exchange("chat/completions", body)
             try:
-                return protocol.read_completion(response, "json_schema" if with_schema else "plain")
+                reply = protocol.read_completion(response, "json_schema" if with_schema else "plain")
             except BadReply as error:
                 raise BadReply(self._clean(str(error))) from None
             except Refusal as refusal:
@@ -245,8 +246,12 @@ class ChatClient:
                     if refusal.kind == "num_images":
                         refusal.message += f" (the request has {len(body) / 1e6:.1f} MB)"
                     raise
-                self.left_out[refusal.kind] = refusal
-                self._tell_once(refusal.kind, logging.WARNING, LEFT_OUT[refusal.kind] % refusal)
+                refused[refusal.kind] = refusal
+            else:
+                for kind, cause in refused.items():  # the answer shows that the server refuses it of all requests
+                    self.left_out[kind] = cause
+                    self._tell_once(kind, logging.WARNING, LEFT_OUT[kind] % cause)
+                return reply
 
     def _tell_once(self, topic: str, level: int, message: str) -> None:
         """Write a line about a topic to the log, once."""
