@@ -129,12 +129,16 @@ class Asking:
         finally:
             heartbeat.cancel()
             for track in self.begun:
-                self._write_gap(track)
+                try:
+                    self._write_gap(track)
+                except (CosflyError, OSError) as error:  # the run already ends with another error
+                    log.error("caption: %s: %s", track.name, error)
 
     async def _ask_track(self, track: TrackInput, teacher: Teacher, tasks: asyncio.TaskGroup) -> None:
         """Begin the windows of a track; another task writes it after the last of them."""
         tally = self.outcome.tracks
         tally.input += 1
+        tally.kept += 1  # also if the run is interrupted here
         windows = self.begun[track] = []
         is_cut = False
         try:
@@ -148,12 +152,12 @@ class Asking:
         except InputError as error:
             del self.begun[track]
             self.failures.append(Failed(id=track.name, code=error.code, message=str(error)))
+            tally.kept -= 1
             tally.failed[error.code] += 1
             log.error("caption: %s: %s", track.name, error)
             return
-        if windows or is_cut:
-            tally.kept += 1
-        else:
+        if not windows and not is_cut:
+            tally.kept -= 1
             tally.dropped["too_short"] += 1
         tasks.create_task(self._write_track(track, is_cut))
 
