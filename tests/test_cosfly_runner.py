@@ -248,11 +248,14 @@ def test_a_second_signal_that_breaks_off_the_ending_ends_the_workers_too(tmp_pat
 
 
 CHILD = """
-import asyncio, sys
+import asyncio, sys, time
 from cosfly.llm.contract import run_until_interrupted
 
 async def ask():
     await asyncio.sleep(3600)
+
+async def wait_in_a_thread():
+    asyncio.get_running_loop().run_in_executor(None, lambda: (print("asking", flush=True), time.sleep(2)))
 
 async def main():
     asyncio.get_running_loop().slow_callback_duration = 3600  # on a busy machine, development mode would report steps
@@ -266,7 +269,8 @@ async def main():
             await asyncio.sleep(3600)
 
 try:
-    run_until_interrupted(main())
+    run_until_interrupted(wait_in_a_thread() if "thread" in sys.argv else main())
+    print("finished", flush=True)
 except KeyboardInterrupt:
     print("ended", flush=True)
     sys.exit(7)
@@ -291,6 +295,10 @@ def interrupted(*words: str) -> tuple[int, list[str], str]:
 
 def test_once_ends_everything_in_order():
     assert interrupted() == (7, ["asking", "ending", "ended"], "")
+
+
+def test_it_also_counts_while_threads_are_waited_for():
+    assert interrupted("thread") == (7, ["asking", "ended"], "")
 
 
 def test_twice_ends_the_process_in_one_line():

@@ -134,13 +134,14 @@ def run_until_interrupted(main: Coroutine[Any, Any, Result], *, keeps_work: bool
 
     previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        return asyncio.run(guarded())
+        result = asyncio.run(guarded())
     except asyncio.CancelledError:
         if received is None:
             raise
-        if received == signal.SIGINT:
-            raise KeyboardInterrupt from None
-        raise SystemExit(128 + received) from None
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+    if received is None:
+        return result
+    # Also one that came after the end of all tasks, while threads of the loop were waited for.
+    raise KeyboardInterrupt if received == signal.SIGINT else SystemExit(128 + received)
