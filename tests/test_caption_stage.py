@@ -103,6 +103,15 @@ def test_a_product_never_loses_captions(tmp_path):
     assert (out / "captions.jsonl").read_bytes() == before
 
 
+def test_a_larger_limit_writes_parts_again_that_were_removed(tree, done, tmp_path):
+    out = tmp_path / "out"
+    run(CaptionConfig(limit=12), tree, out)
+    shutil.rmtree(out / "parts")
+    product = run(CaptionConfig(limit=20), tree, out)
+    lines = (done / "captions.jsonl").read_bytes().splitlines()
+    assert product.read_bytes().splitlines() == lines[:20]
+
+
 def test_bad_flights_are_counted_and_the_others_captioned(tree, tmp_path):
     root = tmp_path / "tree"
     shutil.copytree(tree, root)

@@ -79,7 +79,10 @@ def run(
     if cfg.teacher_kind in EMBEDDED and cfg.judge.url is None:
         items = [Item(track.item_id, track) for track in tracks]
         args = (cfg, vocabulary, stage.path, seed)
-        finished = run_items(stage, items, make_worker, args, workers=workers, watch=watch, label="caption")
+        finished = run_items(
+            stage, items, make_worker, args, workers=workers, watch=watch, label="caption",
+            has_product=lambda item: item.payload.part(stage.path).exists(),
+        )  # fmt: skip
         outcome = AskingOutcome(finished.tally)
     else:
         asking = Asking(stage, cfg, vocabulary, seed, retry_failed=retry_failed)

@@ -57,6 +57,7 @@ def run_items(
     workers: int = 0,
     watch: Watch = Watch(),
     label: str | None = None,
+    has_product: Callable[[Item], bool] = lambda item: True,
 ) -> ItemOutcomes:
     """Run all items that the stage's journal does not hold yet.
 
@@ -68,11 +69,12 @@ def run_items(
     Args:
         make_worker: Module-level function; `make_worker(*worker_args)` returns the work function, once per process.
         workers: Number of processes; 0 works in this process, where an item that hangs is not ended.
+        has_product: Whether what a kept item wrote is still there; otherwise the item is run again.
 
     Returns:
         Records and tally, in the order of `items`, independent of the order of work.
     """
-    line_bytes = _journaled_lines(stage, items)
+    line_bytes = _journaled_lines(stage, items, has_product)
     indices = np.flatnonzero(line_bytes < 0)
     todo = [items[index] for index in indices.tolist()]
     if num_finished := len(items) - len(todo):
@@ -105,15 +107,18 @@ def run_items(
     return finished
 
 
-def _journaled_lines(stage: StageFolder, items: Sequence[Item]) -> np.ndarray:
+def _journaled_lines(stage: StageFolder, items: Sequence[Item], has_product: Callable[[Item], bool]) -> np.ndarray:
     """Return the first byte of each item's record in the journal, (n,) int64; -1 for an item that is not finished."""
     indices = {item.item_id: index for index, item in enumerate(items)}
     assert len(indices) == len(items), "item ids must be unique"
     line_bytes = np.full(len(items), -1)
     journal = stage.journal
     for record in journal.read_as(read_item):
-        if record.id in indices and not isinstance(record, Failed):
-            line_bytes[indices[record.id]] = journal.line_byte
+        index = indices.get(record.id)
+        if index is None or isinstance(record, Failed):
+            continue
+        if not isinstance(record, Kept) or has_product(items[index]):
+            line_bytes[index] = journal.line_byte
     return line_bytes
 
 
