@@ -127,13 +127,19 @@ def test_a_defect_is_found(defect, name, state, words):
     assert words in findings[name].detail
 
 
-def test_an_examination_without_pictures_and_with_a_limit():
+def test_an_examination_without_pictures():
     findings = examine(patient(max_images=0), image={"modalities": []})
     assert {finding.state for finding in findings.values()} == {"ok"}
-    with TeacherServer(respond=patient()) as server:
-        findings = examine_endpoint(server.url, CaptionConfig(), VOCABULARY, 2)
-        assert len(server.bodies) == 2
-    assert findings[-1].name == "limit"
+
+
+@each("defect", [{}, {"refuses_schema": True}], ids=str)  # a refused schema is a request, too
+def test_an_examination_with_a_limit(defect):
+    for limit in (2, 3):
+        with TeacherServer(respond=patient(**defect)) as server:
+            findings = examine_endpoint(server.url, CaptionConfig(), VOCABULARY, limit)
+            assert len(server.bodies) == limit
+        assert findings[-1].name == "limit"
+        assert findings[-1].detail.startswith(f"stopped after {limit} requests")
 
 
 def test_the_command_exits_with_1_when_unusable():

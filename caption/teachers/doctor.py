@@ -113,19 +113,21 @@ class _Examination:
 
     async def _ask(self, messages: list[dict], max_tokens: int, schema: dict | None = None) -> Reply | str:
         """Return the reply to one request, or why it failed."""
-        if self.num_requests == self.most_requests:
-            raise _LimitReached
-        self.num_requests += 1
-        self.advance(1, f"{self.num_requests} requests sent")
         endpoint = self.cfg.endpoint.model_copy(update={"max_tokens": max_tokens})
         try:
-            return await self.client.ask(endpoint.request(messages, [], schema or {}, seed=0))
+            return await self.client.ask(endpoint.request(messages, [], schema or {}, seed=0), self._count)
         except (TimeoutError, httpx.RequestError) as error:
             return self.client.message_of(error)
         except Refusal as refusal:
             return str(refusal) + ("" if refusal.kind == "unknown" else f"; {refusal.meaning.fix}")
         except BadReply as error:
             return str(error)
+
+    def _count(self) -> None:
+        if self.num_requests == self.most_requests:
+            raise _LimitReached
+        self.num_requests += 1
+        self.advance(1, f"{self.num_requests} requests sent")
 
     async def _answers(self) -> bool:
         reply = await self._ask([_user(READY)], self.cfg.endpoint.max_tokens)

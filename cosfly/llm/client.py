@@ -15,7 +15,7 @@ import random
 import re
 import time
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
@@ -219,8 +219,11 @@ class ChatClient:
         self._watch_prompts(reply, request)
         return self._with_full_context(reply, request)
 
-    async def ask(self, request: Request) -> Reply:
+    async def ask(self, request: Request, on_send: Callable[[], None] = lambda: None) -> Reply:
         """Send a request once, and again without what the server refuses of it: a schema, a system role.
+
+        Args:
+            on_send: Called before each of them is sent.
 
         Raises:
             Refusal: The server refuses the request.
@@ -234,6 +237,7 @@ class ChatClient:
             with_schema = self.cfg.json_schema and bool(request.schema) and "schema" not in left_out
             with_system = "no_system" not in left_out
             body = protocol.request_body(self.model, request, with_schema=with_schema, with_system=with_system)
+            on_send()
             response = await self._exchange("chat/completions", body)
             try:
                 reply = protocol.read_completion(response, "json_schema" if with_schema else "plain")
