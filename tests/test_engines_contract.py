@@ -181,6 +181,8 @@ class Recorded:
         self.values = values
         if "top_kk" in values:
             raise TypeError("Unexpected keyword argument 'top_kk'")
+        if values.get("top_k") == -5:
+            raise ValueError("top_k must be 0 (disable), or at least 1, got -5.")
 
 
 class EngineDeadError(Exception):
@@ -299,8 +301,9 @@ def test_a_request_holds_sampling_and_schema(stand_in, model):
 def test_what_vllm_does_not_know_is_a_setting_not_a_crash(stand_in, model):
     with pytest.raises(ConfigError, match=r"caption.vllm.engine.*gdn_prefil"):
         engine_of(model, vllm={"engine": {"gdn_prefil": "triton"}}).load()
-    with pytest.raises(ConfigError, match="top_kk"):
-        engine_of(model, endpoint={"extra_body": {"top_kk": 3}}).load()
+    for extra in ({"top_kk": 3}, {"top_k": -5}):
+        with pytest.raises(ConfigError, match=rf"caption\.endpoint: vLLM rejects a setting.*{next(iter(extra))}"):
+            engine_of(model, endpoint={"extra_body": extra}).load()
     whitespace = {"structured_outputs_config": {"disable_any_whitespace": True}}
     with pytest.raises(EnvironmentMissing, match=r"does not start.*only supported for xgrammar"):
         engine_of(model, vllm={"engine": whitespace}).load()

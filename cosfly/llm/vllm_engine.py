@@ -95,13 +95,19 @@ class VllmEngine:
         try:
             from vllm import LLM
 
-            self.parameters(self.sampling.request([], [], {}, 0))
+            try:
+                self.parameters(self.sampling.request([], [], {}, 0))
+            except (TypeError, ValueError) as error:
+                raise self._rejected("endpoint", error) from None
             return LLM(**self.arguments())
         except TypeError as error:
-            where, fix = f"{self.settings}.vllm.engine, {self.settings}.endpoint", "correct or remove this setting"
-            raise ConfigError("vLLM rejects a setting", where=where, got=_one_line(error), fix=fix) from None
+            raise self._rejected("vllm.engine", error) from None
         except (ImportError, RuntimeError, ValueError, OSError) as error:
             raise EnvironmentMissing("the vLLM engine does not start", where=self.where, got=_one_line(error)) from None
+
+    def _rejected(self, section: str, error: Exception) -> ConfigError:
+        what, fix = f"vLLM rejects a setting in the section {section}", "correct or remove this setting"
+        return ConfigError(what, where=f"{self.settings}.{section}", got=_one_line(error), fix=fix)
 
     def arguments(self) -> dict[str, Any]:
         """Return the keyword arguments of `vllm.LLM`."""
