@@ -131,9 +131,13 @@ async def _try_all(
 
 async def _try_each(window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary) -> list[Trial]:
     """Return a trial of each strategy; none if the free answer is not in conflict or an answer is missing."""
+    trials: list[Trial] = []
     with contextlib.suppress(NoAnswer):
-        trials = [await try_strategy(window, teacher, cfg, vocabulary, strategy) for strategy in STRATEGIES]
-        return [trial for trial in trials if trial is not None]
+        for strategy in STRATEGIES:
+            if (trial := await try_strategy(window, teacher, cfg, vocabulary, strategy)) is None:
+                return []
+            trials.append(trial)
+        return trials
     return []
 
 
