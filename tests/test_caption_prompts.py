@@ -199,7 +199,7 @@ def test_all_problems_are_told_at_once(tmp_path, caplog):
         own_prompts(folder)
     told = "\n".join(record.message for record in caplog.records)
     assert "hints_en.txt: no prompt has this name (did you mean 'hint_en'?)" in told
-    assert "hint_en.txt: the prompt cannot be read; got No such file" in told
+    assert "hint_en.txt: the prompt is missing; copy it from the exported prompts" in told
     assert "system_en.txt" in told
     assert "mirror_user.txt:2: the prompt is empty" in told
     with pytest.raises(ConfigError, match="the folder of prompts does not exist"):
