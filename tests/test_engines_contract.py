@@ -7,9 +7,12 @@ backend is named.
 """
 
 import asyncio
+import errno
 import importlib.util
 import json
+import os
 import sys
+import threading
 import time
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,11 +31,12 @@ from caption.teachers.teacher import make_engine
 from cosfly.formats.captions import Usage, read_captions
 from cosfly.formats.predictions import read_predictions
 from cosfly.llm.answer_text import answer_schema, parse_answer
-from cosfly.llm.answers import AnswerBook, KeptAnswers
+from cosfly.llm.answers import Answer, AnswerBook, KeptAnswers
 from cosfly.llm.client import ChatClient, EndpointConfig
 from cosfly.llm.contract import NoAnswer, Reply, Request, started
 from cosfly.llm.vllm_engine import VllmEngine
-from cosfly.runtime.errors import ConfigError, EnvironmentMissing, TeacherError
+from cosfly.runtime.errors import ConfigError, EnvironmentMissing, StorageError, TeacherError
+from cosfly.runtime.journal import Journal
 from distill.inference import stage as infer
 from distill.schema import open_split
 from specimens import make_playback_tree
@@ -131,6 +135,47 @@ def test_two_that_ask_the_same_at_once_pay_once(tmp_path):
 
     assert len(set(asyncio.run(ask()))) == 1
     assert engine.num_answers == len(kept_answers(tmp_path)) == 1
+
+
+def answer_of(key: str) -> Answer:
+    return Answer(key=key, sample_id="flight_frame_00004", purpose="free/0", text="{}", usage={"prompt_tokens": 10})
+
+
+def test_answers_that_wait_for_the_disk_share_one_sync(tmp_path, monkeypatch):
+    synced, all_wait = [], threading.Event()
+    monkeypatch.setattr(os, "fsync", synced.append)
+
+    async def put_all() -> None:
+        with AnswerBook(tmp_path) as book:
+            book._disk.submit(all_wait.wait, 60)
+            puts = [asyncio.create_task(book.put("flight", answer_of(str(i)))) for i in range(20)]
+            await asyncio.sleep(0)
+            assert not book.totals
+            puts[0].cancel()  # it is written, too
+            all_wait.set()
+            await asyncio.gather(*puts, return_exceptions=True)
+            assert book.totals == {"answers": 20, "prompt_tokens": 200}
+
+    asyncio.run(put_all())
+    assert len(synced) == 1
+    assert sum(1 for _ in Journal(tmp_path / "flight.jsonl").read()) == 20
+
+
+def test_an_answer_that_is_not_on_the_disk_is_not_counted(tmp_path, monkeypatch):
+    def full(number: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+
+    async def put_all() -> None:
+        with AnswerBook(tmp_path) as book:
+            puts = [book.put("flight", answer_of(str(i))) for i in range(3)]
+            failures = await asyncio.gather(*puts, return_exceptions=True)
+            assert [type(failure) for failure in failures] == [StorageError] * 3
+            assert book.get("flight", "0") is None
+            assert not book.totals
+
+    asyncio.run(put_all())
 
 
 def test_an_engine_is_closed_whatever_came_of_its_start():

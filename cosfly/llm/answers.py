@@ -12,9 +12,9 @@ import contextlib
 import logging
 import re
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Self
@@ -85,6 +85,7 @@ class AnswerBook:
             for answer in Journal(path).read_as(Answer.model_validate):
                 self._count(answer)
         self._tracks: dict[str, tuple[Journal, dict[str, Answer]]] = {}  # a track's journal, and its answers by key
+        self._waiting: deque[tuple[Journal, Answer, Future[None]]] = deque()  # answers that are not on the disk
         self._disk = ThreadPoolExecutor(1, "journal")
 
     def get(self, track: str, key: str) -> Answer | None:
@@ -95,15 +96,37 @@ class AnswerBook:
     async def put(self, track: str, answer: Answer) -> None:
         """Write an answer, and wait until it is on the disk; StorageError if the disk is full or not writable."""
         journal, answers = self._open(track)
-        answers[answer.key] = answer
-        self._count(answer)
+        written: Future[None] = Future()
+        self._waiting.append((journal, answer, written))
+        self._disk.submit(self._write_waiting)
 
-        def append() -> None:
-            with journal:  # closed again, so that many tracks in progress take no more files than one
-                journal.append(answer.model_dump(mode="json"))
+        def keep(done: asyncio.Future[None]) -> None:
+            if done.exception() is None:
+                answers[answer.key] = answer
+                self._count(answer)
 
-        # Shielded: an answer is written though its window is cancelled.
-        await asyncio.shield(asyncio.get_running_loop().run_in_executor(self._disk, append))
+        on_disk = asyncio.wrap_future(written)
+        on_disk.add_done_callback(keep)
+        await asyncio.shield(on_disk)  # an answer is written though its window is cancelled
+
+    def _write_waiting(self) -> None:
+        """Write all waiting answers, and wait for the disk once for each journal."""
+        batches: dict[Journal, list[tuple[Answer, Future[None]]]] = {}
+        while self._waiting:
+            journal, answer, written = self._waiting.popleft()
+            batches.setdefault(journal, []).append((answer, written))
+        for journal, batch in batches.items():
+            try:
+                with journal:  # closed again, so that many tracks in progress take no more files than one
+                    for answer, _ in batch:
+                        journal.append(answer.model_dump(mode="json"), sync=False)
+                    journal.sync()
+            except Exception as error:
+                for _, written in batch:
+                    written.set_exception(error)
+            else:
+                for _, written in batch:
+                    written.set_result(None)
 
     def forget(self, track: str) -> None:
         """Remove a finished track from memory; its journal stays on the disk."""
