@@ -62,7 +62,9 @@ SERVER_FAULTS = {
         "--mmproj"),
     "another model": (404, f"The model `{MODEL}` does not exist.", "correct the URL or --model"),
     "a parameter": (400, "Unsupported parameter: 'max_tokens' is not supported with this model.", "extra_body"),
-    "no credit": (429, "You exceeded your current quota. insufficient_quota", "account"),
+    "no credit": (429, "You exceeded your current quota. insufficient_quota",
+        "the account has no credit left"),
+    "a wrong key": (401, "Incorrect API key provided.", "set COSFLY_API_KEY"),
 }  # fmt: skip
 
 

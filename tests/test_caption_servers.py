@@ -297,6 +297,7 @@ def windows_of(out: Path) -> Counter[str]:
 LISTS: dict[str, tuple] = {
     "an error": (page(500, "broken"), "HTTP 500 broken"),
     "401 that quotes the key": (page(401, "bad key sk-very-secret"), "refuses the API key; got HTTP 401 bad key ***"),
+    "403 in the words of a filter": (page(403, "flagged by our safety system"), "refuses the API key; got HTTP 403 flagged"),
     "names of wrong types": (page(200, json.dumps({"data": [{"id": 7}, {"id": "a\x1b[2J"}, "b", {"id": "x" * 999},
         {"id": MODEL}]})), None),
     "ten thousand models": (page(200, json.dumps({"data": [{"id": f"m{i}"} for i in range(10_000)]})),

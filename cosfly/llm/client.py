@@ -247,7 +247,7 @@ class ChatClient:
                 refusal.message = self._clean(refusal.message)
                 has_system = with_system and request.messages[0]["role"] == "system"
                 if not {"schema": with_schema, "no_system": has_system}.get(refusal.kind):
-                    if refusal.kind == "num_images":
+                    if refusal.kind == "pictures":
                         refusal.message += f" (the request has {len(body) / 1e6:.1f} MB)"
                     raise
                 refused[refusal.kind] = refusal
@@ -336,7 +336,8 @@ class ChatClient:
             self._warn(str(refusal), "waiting for the server")
             await asyncio.sleep(LOADING_PAUSE_S)
         if response.status in (401, 403):
-            raise self._refused(refusal, 0.0)
+            meaning = refusal.meaning if refusal.meaning.ends_run else protocol.KEY
+            raise self._error(meaning.what, got=str(refusal), fix=meaning.fix)
         models = protocol.read_models(response)
         if models is None and not wanted:
             what = "the server does not return a list of models, so it may not be an OpenAI-compatible endpoint"

@@ -23,9 +23,7 @@ from cosfly.runtime.config import read_yaml
 from cosfly.runtime.escaping import without_keys
 from cosfly.runtime.model_json import DECLINED
 
-Kind = Literal[
-    "account", "too_long", "num_images", "no_vision", "no_system", "schema", "parameter", "content", "unknown"
-]
+Kind = Literal["account", "too_long", "pictures", "no_system", "schema", "parameter", "content", "unknown"]
 
 KEY_VARIABLE = "COSFLY_API_KEY"
 MOST_CHARACTERS = 4000  # of a text that are searched: some servers echo the request
@@ -114,8 +112,13 @@ MEANINGS: dict[Kind, Meaning] = {
 ADDRESS = Meaning(
     "the server does not have this model, or the URL is not a chat endpoint", "correct the URL or --model", True
 )
+KEY = Meaning(
+    "the API key is missing, or the server refuses the API key",
+    f"set {KEY_VARIABLE} to a valid key, then run the same command again",
+    True,
+)
 # The meaning of a status if no pattern matches the text.
-STATUSES = dict.fromkeys((401, 403), MEANINGS["account"]) | dict.fromkeys((*range(300, 400), 404, 405), ADDRESS)
+STATUSES = dict.fromkeys((401, 403), KEY) | dict.fromkeys((*range(300, 400), 404, 405), ADDRESS)
 # Statuses of a server that is busy or away (above 511: Cloudflare's, 424: TGI's of a failed generation); only an empty
 # account takes precedence.
 AWAY = frozenset({408, 409, 424, 425, 429, 502, 503, 504, *range(520, 531)})
