@@ -135,10 +135,9 @@ async def _try_each(window: Window, teacher: Teacher, cfg: CaptionConfig, vocabu
     with contextlib.suppress(NoAnswer):
         for strategy in STRATEGIES:
             if (trial := await try_strategy(window, teacher, cfg, vocabulary, strategy)) is None:
-                return []
+                break
             trials.append(trial)
-        return trials
-    return []
+    return trials if len(trials) == len(STRATEGIES) else []
 
 
 async def try_strategy(

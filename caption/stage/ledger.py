@@ -1,5 +1,4 @@
-"""What became of every window: the reasons to drop one, counts that add up, and `report.html`, a page of them with some
-samples."""
+"""The outcomes of windows: the reasons to drop one, counts that add up, and `report.html`, a page with samples."""
 
 from __future__ import annotations
 

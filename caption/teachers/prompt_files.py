@@ -61,14 +61,12 @@ def own_prompts(folder: Path) -> dict[str, str]:
     found, problems = dict[str, str](), list[str]()
     for name in sorted({*shipped_prompts(), *(path.stem for path in folder.glob(f"*{SUFFIX}"))}):
         path = folder / f"{name}{SUFFIX}"
-        if not path.exists():
-            problems.append(f"{path}: the prompt is missing; copy it from the exported prompts")
-            continue
         try:
             found[name] = read_text(path, what="prompt", tree=folder)
             problems += _problems(path, found[name])
         except InputError as error:
-            problems.append(str(error))
+            missing = f"{path}: the prompt is missing; copy it from the exported prompts"
+            problems.append(str(error) if path.exists() else missing)
     for problem in problems:
         log.error("%s", problem)
     if problems:

@@ -169,11 +169,7 @@ def make_engine(cfg: CaptionConfig) -> Engine:
 
 @asynccontextmanager
 async def open_teacher(
-    cfg: CaptionConfig,
-    book: AnswerBook,
-    seed: int,
-    budget: Budget,
-    retried: frozenset[str] = frozenset(),
+    cfg: CaptionConfig, book: AnswerBook, seed: int, budget: Budget, retried: frozenset[str] = frozenset()
 ) -> AsyncIterator[Teacher]:
     """Connect to the teacher that the settings name."""
     if cfg.teacher_kind in EMBEDDED:

@@ -112,11 +112,7 @@ MEANINGS: dict[Kind, Meaning] = {
 ADDRESS = Meaning(
     "the server does not have this model, or the URL is not a chat endpoint", "correct the URL or --model", True
 )
-KEY = Meaning(
-    "the API key is missing, or the server refuses the API key",
-    f"set {KEY_VARIABLE} to a valid key, then run the same command again",
-    True,
-)
+KEY = Meaning("the API key is missing, or the server refuses the API key", f"set {KEY_VARIABLE} to a valid key", True)
 # The meaning of a status if no pattern matches the text.
 STATUSES = dict.fromkeys((401, 403), KEY) | dict.fromkeys((*range(300, 400), 404, 405), ADDRESS)
 # Statuses of a server that is busy or away (above 511: Cloudflare's, 424: TGI's of a failed generation); only an empty
