@@ -54,9 +54,6 @@ bench.TURNS, bench.census_town = 1, lambda name, seed: load(SyntheticConfig(), s
     ("bench_render", "memory --frames 20", r"Memory", SMALL_TOWN),
     ("bench_training", "--batch 1 --steps 1", r'"tokens_per_s": \d'),
     ("bench_training", "--check", r'"relative_difference_of_gradients": \d'),
-    ("checkpoints", "--map RUN/maps/boxes_3d.json --simplified RUN/simplify/step2_simplified.json "
-             "--paths RUN/pedestrians/path.json --captions RUN/caption/captions.jsonl --walks 1 --out OUT",
-             r"noise-0=[01]\.\d+", HERE + "bench.NOISE = (0.0,)"),
     ("seeing_student", "--language none.gguf --epochs 1 --workers 1 --without none --out OUT RUN/render",
              r'"target_found": {"trained": [01]\.\d+', """
 bench.VISION.update(hidden_size=32, intermediate_size=32, num_hidden_layers=1, num_attention_heads=2)
