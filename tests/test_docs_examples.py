@@ -16,7 +16,7 @@ from test_docs_run import small_run
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
 NOTEBOOK = json.loads((ROOT / "docs/release.ipynb").read_text(encoding="utf-8"))
-NAME = re.compile(r"^# (\S+\.py)$")
+NAME = re.compile(r"^# (\S+\.(?:py|md))$")
 PRODUCTS = (
     "work/blocks/boxes_3d.json", "work/overhead/drone_trace.json", "work/compared/compare.json",
     "work/thermal/manifest.json", "work/echo/captions.jsonl", "work/inspect/report.html",
