@@ -1,6 +1,8 @@
 """`cosfly fly`: students after walkers, whatever a student answers and after a kill; `--relabel`: frames of its mistakes."""
 
+import itertools
 import json
+import shutil
 import threading
 from pathlib import Path
 
@@ -20,8 +22,9 @@ from cosfly.formats.captions import read_captions
 from cosfly.formats.episodes import EPISODES, Episode, read_episode
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
-from cosfly.llm.student_chat import write_chat_format
+from cosfly.llm.student_chat import read_chat_format, write_chat_format
 from cosfly.runtime.errors import NothingKept
+from distill.inference.stage import Completion
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split
 from distill.student.random_student import make_random_student
@@ -190,6 +193,29 @@ def test_a_student_in_this_process_answers_all_flights_as_one_batch(town, tmp_pa
         assert record.engine == "transformers"
         assert {frame.answer for frame in record.decisions} == {"unreadable"}  # of four tokens
         assert all(frame.words is not None and frame.answer_s > 0 for frame in record.decisions)
+
+
+@pytest.mark.slow
+def test_a_student_can_answer_with_its_decision_alone(town, tmp_path, in_this_process, student, monkeypatch):
+    few = "--set distill.infer.device=cpu --set fly.most_decisions=4 --set fly.reasons=false"
+    chat_format = read_chat_format(student)
+    assert chat_format.decision == "first"
+    last = shutil.copytree(student, tmp_path / "last")
+    write_chat_format(last, chat_format.model_copy(update={"decision": "last"}))
+    refused = attempt(town, tmp_path / "refused", f"{SHORT} {few} --student transformers:{last}")
+    assert "writes its reasons before its decision" in str(refused.exception)
+    texts = itertools.cycle(
+        ['{"flight_decision": "move_forward', "{'flight_decision': \"Hover", '{"flight_decision": "up', "?"]
+    )
+
+    def answers(student, rows, pictures, *, max_tokens, stop):
+        assert stop == '",'
+        return [Completion(next(texts), 9, True) for _ in rows]
+
+    monkeypatch.setattr("distill.inference.stage.generate", answers)
+    flown = fly(town, tmp_path / "flown", f"{SHORT} {few} --student transformers:{student}")
+    found = {(frame.answer, frame.action) for record in flown.values() for frame in record.decisions}
+    assert found == {("ok", "move_forward"), ("unreadable", None), ("invalid", None)}
 
 
 @pytest.mark.slow

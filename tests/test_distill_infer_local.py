@@ -80,6 +80,15 @@ def test_each_sample_has_the_answer_that_it_has_alone(place, clean):
     assert told(predictions) == alone
     assert len(set(alone.values())) > 1
     assert {prediction.model for prediction in predictions} == {"student+trained"}
+    # With a text that ends answers, they are the same up to that text.
+    rows, features = [student.encode(sample, ADAPTER_PIXELS) for sample in samples[:4]], []
+    for sample in samples[:4]:
+        features += features_of(student, [sample], trees)
+    texts = [one.text for one in generate(student, rows, features, max_tokens=NUM_TOKENS)]
+    stop = next(char for char in texts[0][2:] if char.strip())
+    cut = generate(student, rows, features, max_tokens=NUM_TOKENS, stop=stop)
+    assert [one.text for one in cut] == [text.partition(stop)[0] for text in texts]
+    assert cut[0].is_finished
 
 
 def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):

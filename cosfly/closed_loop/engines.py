@@ -32,16 +32,18 @@ from cosfly.formats.frames import BYSTANDER_COLUMNS, FILE_NAMES, depth_file, fra
 from cosfly.formats.places import sample_id
 from cosfly.geometry.axes import wrap_deg
 from cosfly.geometry.motion import in_axes_of
-from cosfly.llm.answer_text import parse_answer
+from cosfly.llm.answer_text import normalize_action, parse_answer
 from cosfly.llm.answers import Answer as BookAnswer
 from cosfly.llm.answers import AnswerBook
 from cosfly.llm.contract import NoAnswer
-from cosfly.llm.student_chat import CHAT_FORMAT_FILE
-from cosfly.runtime.errors import CosflyError
+from cosfly.llm.student_chat import CHAT_FORMAT_FILE, read_chat_format
+from cosfly.runtime.errors import ConfigError, CosflyError
+from cosfly.runtime.model_json import find_object
 from cosfly.runtime.seeding import rng_for
 from distill.inference.stage import InferConfig, Inputs, LocalAnswers
 from distill.schema import Sample
 
+DECISION_END = '",'  # behind a decision that is the first field of an answer
 NO_SET = "decision_not_in_closed_set"  # of readable answers with an unknown decision
 
 
@@ -237,7 +239,13 @@ class LocalEngine(PromptedEngine):
     def _open(self, cfg: FlyConfig, infer: InferConfig, seed: int) -> None:
         model = Path(cfg.student.partition(":")[2])
         inputs = Inputs((), {"": Path(self._scratch.name)}, model, cfg.adapter)
-        self._local = LocalAnswers(infer, inputs, self._book)
+        self._has_reasons = cfg.reasons
+        if not cfg.reasons and read_chat_format(cfg.adapter or model).decision != "first":
+            raise ConfigError(
+                "the student writes its reasons before its decision", where="fly.reasons", got="false",
+                fix="leave fly.reasons at true, or train a student with distill.prepare.decision=first",
+            )  # fmt: skip
+        self._local = LocalAnswers(infer, inputs, self._book, stop="" if cfg.reasons else DECISION_END)
         self.name = inputs.name
 
     async def _ask_all(self, questions: Sequence[Question]) -> list[EngineDecision]:
@@ -256,6 +264,15 @@ class LocalEngine(PromptedEngine):
             else:
                 decisions.append(EngineDecision("none", words=answer.message[:MOST_WORDS]))
         return decisions
+
+    def _read(self, text: str, question: Question, answer_s: float | None, finish_reason: str | None) -> EngineDecision:
+        if self._has_reasons:
+            return super()._read(text, question, answer_s, finish_reason)
+        answer = find_object(text + '"}', ("flight_decision",), finish_reason)
+        if answer.value is None:
+            return EngineDecision("unreadable", None, text[:MOST_WORDS], answer_s)
+        action = normalize_action(str(answer.value.get("flight_decision", "")))
+        return EngineDecision("ok" if action else "invalid", action, text[:MOST_WORDS], answer_s)
 
     @staticmethod
     def _sample(question: Question) -> Sample:

@@ -90,6 +90,9 @@ class FlyConfig(Config):
     most_decisions: int = Field(
         0, ge=0, description="an episode ends after this number of decisions; 0: with its trajectory"
     )
+    reasons: bool = Field(
+        True, description="false: a student of transformers: answers with its decision alone, which must come first"
+    )
     side_by_side: int = Field(16, ge=1, le=1024, description="episodes that a worker flies at once, as one batch")
     tree: bool = Field(True, description="render the playback tree of what was flown")
     trained_on: tuple[str, ...] | None = Field(None, description="towns of the student's training; null: unknown")

@@ -159,13 +159,14 @@ class Completion(NamedTuple):
 
 
 def generate(
-    student: Student, rows: Sequence[EncodedSample], pictures: Sequence[Tensors], *, max_tokens: int
+    student: Student, rows: Sequence[EncodedSample], pictures: Sequence[Tensors], *, max_tokens: int, stop: str = ""
 ) -> list[Completion]:
     """Answer a batch of prompts greedily; the answers in `rows` are not used.
 
     Args:
         pictures: features of the pictures of all rows, row after row.
         max_tokens: longest answer, the end token included.
+        stop: an answer ends before this text as well.
 
     Returns:
         One answer for each row, in their order.
@@ -183,18 +184,22 @@ def generate(
         max_new_tokens=max_tokens,
         eos_token_id=end,
         pad_token_id=student.pad_token_id,
+        stop_strings=stop or None,
         cache_implementation="static" if is_one_type else "dynamic",
         disable_compile=True,  # a compiled step holds for one batch size and length, and costs a minute
     )
     core.generation_config = config  # settings for sampling of the model folder would complete those of `config`
     student.model.eval()
     with torch.inference_mode(), student.computing(), shown(student, pictures) as seen:
-        found = core.generate(**inputs, **seen)
+        found = core.generate(**inputs, **seen, tokenizer=student.tokenizer)
     completions = []
     for tokens in found[:, num_prompt:].tolist():
         written = tokens[: tokens.index(end)] if end in tokens else tokens
         text = student.tokenizer.decode(written, skip_special_tokens=False).removeprefix(student.lead)
-        completions.append(Completion(text, len(written), end in tokens))
+        is_finished = end in tokens
+        if stop and stop in text:
+            text, is_finished = text.partition(stop)[0], True
+        completions.append(Completion(text, len(written), is_finished))
     return completions
 
 
@@ -205,8 +210,8 @@ class LocalAnswers:
     run that was killed and resumed gives the same answers as one that was not.
     """
 
-    def __init__(self, cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> None:
-        """Load the student."""
+    def __init__(self, cfg: InferConfig, inputs: Inputs, book: AnswerBook, stop: str = "") -> None:
+        """Load the student. stop: its answers end before this text."""
         if cfg.constrained:
             words, fix = "the engine transformers cannot enforce a schema", "use the engine endpoint or vllm"
             raise ConfigError(words, where=f"{STAGE}.constrained", fix=fix)
@@ -217,7 +222,7 @@ class LocalAnswers:
         if not self.student.has_pictures and inputs.samples and inputs.samples[0].views:
             log.warning("%s: the student takes no pictures: it answers from the text state alone", STAGE)
         self.book, self.model, self.batch_size, self.max_tokens = book, inputs.name, cfg.batch_size, cfg.max_new_tokens
-        self.max_pixels = cfg.max_pixels or inputs.taught_pixels
+        self.max_pixels, self._stop = cfg.max_pixels or inputs.taught_pixels, stop
         self._reader = PictureReader(self.student, inputs.trees, self.max_pixels)
 
     async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[SampleOutcome, None]:
@@ -236,7 +241,7 @@ class LocalAnswers:
     def _key(self, sample: Sample) -> str:
         """Return a digest of what the answer depends on, besides the inputs in the folder's record."""
         asked = sample.model_dump(mode="json", include={"run", "window", "views", "picture_px", "prompt", "language"})
-        return sha256_bytes(dump_json([self.model, sample.sample_id, asked, self.max_tokens]).encode())
+        return sha256_bytes(dump_json([self.model, sample.sample_id, asked, self.max_tokens, self._stop]).encode())
 
     def _answer(self, batch: list[Sample]) -> list[SampleOutcome]:
         """Answer a batch."""
@@ -271,7 +276,8 @@ class LocalAnswers:
 
         seen = [tensors for _, pictures in rows for tensors in pictures]
         try:
-            return generate(self.student, [row for row, _ in rows], seen, max_tokens=self.max_tokens)
+            inputs = [row for row, _ in rows]
+            return generate(self.student, inputs, seen, max_tokens=self.max_tokens, stop=self._stop)
         except torch.OutOfMemoryError as error:
             if len(rows) == 1:
                 where, fix = f"{STAGE}.max_pixels", "lower max_pixels or max_new_tokens, and choose another --out"
