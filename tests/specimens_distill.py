@@ -94,7 +94,7 @@ def make_adapter(base: Path, folder: Path, **changes) -> Path:
     from peft import LoraConfig, get_peft_model
 
     from distill.student.model import load_student
-    from distill.student.saving import write_adapter_facts
+    from distill.student.saving import ADAPTER_FACTS, ADAPTER_FORMAT, AdapterFacts, base_digests
     from distill.training.stage import target_modules
 
     student = load_student(base, device="cpu")
@@ -109,6 +109,6 @@ def make_adapter(base: Path, folder: Path, **changes) -> Path:
             if "lora_B" in name:
                 tensor.mul_(0.02)
     student.model.save_pretrained(folder)
-    write_adapter_facts(folder, base)
+    write_model(folder / ADAPTER_FACTS, AdapterFacts(base_sha256=base_digests(base)), ADAPTER_FORMAT)
     write_chat_format(folder, TEACHING)
     return folder

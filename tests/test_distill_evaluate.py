@@ -1,5 +1,6 @@
 """distill/evaluation."""
 
+import html
 import json
 import re
 import shutil
@@ -16,7 +17,7 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import dump_json, read_model
 from distill.evaluation import figures
 from distill.evaluation.figures import Answers, coc_of, measure, text_of
-from distill.evaluation.report import REPORT_FORMAT, Evaluation
+from distill.evaluation.report import REPORT_FORMAT, Evaluation, notes_of, tables_of
 from distill.evaluation.stage import Scorer, asked_samples, floors_of, majority, run
 from distill.inference.stage import make_prediction
 from distill.prepare.stage import PrepareConfig, make_sample
@@ -241,11 +242,10 @@ def test_without_an_encoder_the_report_says_so_and_gives_no_number(place):
     assert accuracy == {"one": 4 / 8, "majority": 4 / 8, "teacher": 1}  # no rule: no sample has a past
     assert (teacher["accuracy_on_labels"].value, teacher["bertscore_f1"].value) == (1, None)
     assert report.students["one"].without_decision == {"broken_json": 2, "no_json_object": 2}
-    page = (place / "out" / "evaluation.md").read_text()
-    assert "BERTScore of en was not computed, because no encoder was passed" in page
+    assert "BERTScore of en was not computed, because no encoder was passed." in notes_of(report)
     assert len(report.examples) == 12
     again = run([place / "one"], place / "set", place / "again")
-    for name in ("report.json", "evaluation.md", "evaluation.html"):
+    for name in ("report.json", "evaluation.html"):
         assert (again.parent / name).read_bytes() == (path.parent / name).read_bytes()
 
 
@@ -261,18 +261,21 @@ def test_a_student_is_not_named_like_another_column(place):
 def test_the_table_has_everybody_side_by_side(place):
     """Students, teacher, baselines and the paper, in one row of a figure; and the differences of students."""
     out = run([place / "one", place / "other"], place / "set", place / "out").parent
-    page = (out / "evaluation.md").read_text()
-    header, *rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.split("\n") if line[:1] == "|"]
+    main, _, pair = tables_of(read_report(out), "en")
     columns = ["one", "other", "teacher", "baseline: majority", "paper: Qwen3.5-2B + LoRA", "paper: Qwen3.5-4B + LoRA"]
-    assert header[1:] == columns
-    table = {row[0]: [cell.split(" ")[0] for cell in row[1:]] for row in rows[: len(figures.FIGURES)]}
+    assert main.columns[1:] == columns
+    table = {row[0]: [cell.split(" ")[0] for cell in row[1:]] for row in main.rows}
     assert table["answers that parse"] == ["75.0%", "100.0%", "100.0%", "100.0%", "100.0%", "100.0%"]
     assert table["decision is the teacher's, parsed answers"][-2:] == ["68.7%", "70.1%"]
     assert table["verdict: hard conflict"] == ["0.0%"] * 4 + ["-"] * 2
-    assert re.search(r"\| decision is the teacher's, all answers \| 50\.0% \([\d.]+% to [\d.]+%\) \| 100\.0% \|", page)
-    assert "### one minus other" in page
-    difference = next(row for row in rows if row[0].startswith("decision is the teacher's, all") and len(row) == 2)
+    agreement = next(row for row in main.rows if row[0] == "decision is the teacher's, all answers")
+    assert re.fullmatch(r"50\.0% \([\d.]+% to [\d.]+%\)", agreement[1])
+    assert agreement[2] == "100.0%"
+    assert pair.title == "one minus other"
+    difference = next(row for row in pair.rows if row[0] == "decision is the teacher's, all answers")
     assert re.fullmatch(r"-50\.0% \(-[\d.]+% to -[\d.]+%\)", difference[1])
+    page = html.unescape((out / "evaluation.html").read_text(encoding="utf-8"))
+    assert all(cell in page for cell in (*columns, pair.title, *agreement[1].split(" ("), *difference[1].split(" (")))
 
 
 def test_values_of_a_students_texts_come_from_the_captions_made_of_them(place, tmp_path):
@@ -358,8 +361,8 @@ def test_an_evaluation_with_an_encoder_names_it(place, encoder):
     assert f1["teacher"] is None
     assert report.languages["en"].who["majority"].figures["values_matched"].value is None
     assert sum(report.languages["en"].histograms["one"]) == 6  # of parsed answers
-    page = (out / "evaluation.md").read_text()
-    assert f"BERTScore F1 ({encoder.parent.name}/encoder layer 3)" in page
+    rows = [row[0] for row in tables_of(report, "en")[0].rows]
+    assert f"BERTScore F1 ({encoder.parent.name}/encoder layer 3)" in rows
 
 
 @pytest.mark.parametrize(("name", "config", "words"), [

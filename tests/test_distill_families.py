@@ -113,11 +113,11 @@ def test_a_family_trains_resumes_merges_and_answers(place, family, tmp_path):
 def test_the_decision_can_weigh_more_and_come_first(place, built_once):
     folder = built_once("family_llama", lambda root: make_family("llama", root / "llama")) / "llama"
     own, sample = load_student(folder, device="cpu"), samples_of(place)[0].without_pictures()
-    row = own.encode(sample, weights={"flight_decision": 20.0, "reasoning_trace": 0.5})
-    for weight, field in ((20.0, "flight_decision"), (0.5, "reasoning_trace")):
-        text = own.tokenizer.decode(row.answer_ids[row.weights == weight])
-        assert json.loads(sample.answer)[field] in text
-        assert len(text) < len(json.loads(sample.answer)[field]) + 4
+    row = own.encode(sample, decision_weight=20.0)
+    text = own.tokenizer.decode(row.answer_ids[row.weights == 20.0])
+    assert sample.decision in text
+    assert len(text) < len(sample.decision) + 4
+    assert (row.weights == 1.0).sum() > 10
     assert row.weights[-1] == 1.0
     assert np.array_equal(own.encode(sample).weights, np.ones(len(row.answer_ids), np.float32))
 

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -164,6 +165,32 @@ def test_stopped_and_continued_is_the_same(place, tmp_path):
     assert (out / name).read_bytes() == (whole / name).read_bytes()
 
 
+@pytest.mark.parametrize(("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
+def test_a_signal_ends_a_training_after_its_step_with_a_checkpoint(place, tmp_path, monkeypatch, caplog, number, error):
+    """A second signal, in the step of the first, ends it at once."""
+    steps, real = [], fit.train_step
+
+    def interrupted(*args):
+        steps.append(1)
+        for _ in range({3: 1, 5: 2}.get(len(steps), 0)):
+            signal.raise_signal(number)
+        return real(*args)
+
+    monkeypatch.setattr(fit, "train_step", interrupted)
+    before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # as the command line has it
+    caplog.set_level("INFO")
+    try:
+        for _ in range(2):
+            with pytest.raises(error):
+                run(place, tmp_path, max_steps=6, validate_every_steps=6)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["step_00000003"]
+    assert "no checkpoint yet" in caplog.text
+    assert "resumed after step 3" in caplog.text
+    assert not (tmp_path / "adapter").exists()
+
+
 @pytest.mark.slow
 def test_a_student_that_overfits_answers_right(place, tmp_path):
     learnt = samples_of(place)[:2]
@@ -289,11 +316,12 @@ def test_a_loss_that_is_no_number_leaves_the_last_good_checkpoint(place, tmp_pat
 
 
 WORKERS = """
-import os, time
+import os, signal, time
 from distill.training.loading import in_order
 for pid, _ in in_order(lambda order: (os.getpid(), bytes(10_000_000)), range(200), 2):
+    os.kill(pid, signal.SIGTERM)  # to which a worker does not react: its parent ends it
     print(pid, flush=True)
-    time.sleep(0.5)
+    time.sleep(0.1)
 """
 
 
@@ -304,7 +332,7 @@ def test_workers_end_with_a_training_that_was_killed(tmp_path):
         [sys.executable, "-c", WORKERS], stdout=subprocess.PIPE, text=True, env=environment
     ) as process:
         assert process.stdout is not None
-        workers = {int(process.stdout.readline()) for _ in range(2)}
+        workers = {int(process.stdout.readline()) for _ in range(12)}  # more than were computed before the first signal
         assert len(workers) == 2
         process.kill()
     wait_until(lambda: not any(map(is_running, workers)))

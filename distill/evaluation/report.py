@@ -1,4 +1,4 @@
-"""The report of an evaluation: `report.json`, and its tables as a page of Markdown and of HTML."""
+"""The report of an evaluation: `report.json`, and its tables as a page."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 from cosfly.formats.captions import FIELDS, TOKENS, Coc, Language
 from cosfly.formats.episodes import Figure
 from cosfly.formats.predictions import Prediction, Split
-from cosfly.runtime.escaping import for_markdown
 from cosfly.runtime.json_io import FileFormat, Record
 from cosfly.viz.page import page
 from cosfly.viz.tables import TextTable
@@ -165,19 +164,7 @@ def notes_of(report: Evaluation) -> list[str]:
     return notes
 
 
-def markdown_of(report: Evaluation) -> str:
-    """Return the report as a page of Markdown."""
-    lines = [f"# {', '.join(map(for_markdown, report.students))} on {report.split}", ""]
-    for language in report.languages:
-        for number, table in enumerate(tables_of(report, language)):
-            columns, *rows = [[for_markdown(cell) for cell in row] for row in [table.columns, *table.rows]]
-            text = TextTable(table.title, columns, rows).markdown()
-            lines += [f"{'###' if number else '##'} {for_markdown(table.title)}", "", text]
-    lines += ["## How it was measured", "", *(f"- {for_markdown(note)}" for note in notes_of(report))]
-    return "\n".join(lines) + "\n"
-
-
-# --- the HTML page ----------------------------------------------------------------------------------------------------
+# --- the page ---------------------------------------------------------------------------------------------------------
 
 
 def page_of(report: Evaluation) -> str:

@@ -24,25 +24,8 @@ from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import write_model
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally, read_manifest
 from cosfly.runtime.seeding import rng_for
-from distill.evaluation.figures import (
-    TEACHER,
-    Answers,
-    Measurement,
-    coc_of,
-    decision_number,
-    measure,
-    text_of,
-)
-from distill.evaluation.report import (
-    REPORT,
-    REPORT_FORMAT,
-    Evaluation,
-    Example,
-    Metric,
-    StudentRecord,
-    markdown_of,
-    page_of,
-)
+from distill.evaluation.figures import TEACHER, Answers, Measurement, coc_of, decision_number, measure, text_of
+from distill.evaluation.report import REPORT, REPORT_FORMAT, Evaluation, Example, Metric, StudentRecord, page_of
 from distill.schema import Sample, open_split
 from distill.student.model import pick_device, quiet_transformers, require
 
@@ -67,7 +50,7 @@ def run(
     seed: int = 0,
     resume: Resume = "if-same",
 ) -> Path:
-    """Read the predictions of students and their training set; write `report.json` and two pages.
+    """Read the predictions of students and their training set; write `report.json` and a page.
 
     Args:
         predictions: `predictions.jsonl` of each student or its folder; the folder's name is the student's. Students are
@@ -130,11 +113,10 @@ def run(
         examples=[example for part in by_language.values() for example in _examples(part, found, most, seed)],
     )  # fmt: skip
     write_model(out / REPORT, report, REPORT_FORMAT)
-    write_bytes(out / "evaluation.md", markdown_of(report).encode())
     write_bytes(out / "evaluation.html", page_of(report).encode())
     num_left = len(samples) - len(asked)
     tally = Tally(input=len(samples), kept=len(asked), dropped={"not_asked": num_left} if num_left else {})
-    products = [out / name for name in (REPORT, "evaluation.md", "evaluation.html")]
+    products = [out / REPORT, out / "evaluation.html"]
     stage.finish(products, tally, split=splits[0], models={name: one.model for name, one in report.students.items()})
     return out / REPORT
 

@@ -17,15 +17,13 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from cosfly.formats.captions import FIELDS
 from cosfly.llm.student_chat import IMAGE_PART, chat_messages, limited_size
 from cosfly.runtime.errors import InputError
 from distill.schema import Sample
 
 IGNORED = -100  # label of tokens without a loss, the convention of PyTorch's cross entropy
 MARKUP = re.compile(r"[<\[|].+[>\]|]")  # tokens such as <think>, [INST], <|im_end|>
-
-
-FieldWeights = Mapping[str, float]  # field of an answer -> weight of its tokens in the loss; of all others 1
 
 
 @dataclass(frozen=True)
@@ -179,11 +177,12 @@ class Processor:
         blank = Image.new("RGB", size_px)
         return self._sized(text=[text], images=[[blank] * count], add_special_tokens=False)
 
-    def encode(self, sample: Sample, max_pixels: int = 0, weights: FieldWeights | None = None) -> EncodedSample:
+    def encode(self, sample: Sample, max_pixels: int = 0, decision_weight: float = 1.0) -> EncodedSample:
         """Return the tokens of a sample.
 
         Args:
             max_pixels: limit of a picture, as in `limited_size`; 0: none.
+            decision_weight: of the tokens of the decision in the loss; others have 1.
         """
         size_px = limited_size(sample.picture_px, max_pixels)
         try:
@@ -198,7 +197,7 @@ class Processor:
         return EncodedSample(
             prompt_ids=ids,
             answer_ids=np.array([*answer["input_ids"], self.end_token_id], dtype=np.int32),
-            weights=_token_weights(text, answer, weights or {}),
+            weights=_token_weights(text, answer, decision_weight),
             kinds=np.zeros(len(ids), np.int8) if kinds is None else np.array(kinds[0], dtype=np.int8),
         )
 
@@ -229,15 +228,14 @@ class Processor:
         return {name: np.asarray(value) for name, value in found.items() if name not in of_text}
 
 
-def _token_weights(text: str, tokens: Mapping[str, Any], weights: FieldWeights) -> np.ndarray:
+def _token_weights(text: str, tokens: Mapping[str, Any], decision_weight: float) -> np.ndarray:
     """Return the weight of each token of an answer and of its end token, (m,) float32."""
     found = np.ones(len(tokens["input_ids"]) + 1, dtype=np.float32)
-    for field, weight in weights.items():
-        key = re.search(rf'"{field}"\s*:\s*"', text)
-        if key is not None and "offset_mapping" in tokens:
-            _, end = json.JSONDecoder().raw_decode(text, key.end() - 1)  # behind the closing quotation mark
-            begins, ends = np.array(tokens["offset_mapping"]).reshape(-1, 2).T
-            found[:-1][(ends > key.end()) & (begins < end - 1)] = weight
+    key = re.search(rf'"{FIELDS[-1]}"\s*:\s*"', text)
+    if key is not None and "offset_mapping" in tokens:
+        _, end = json.JSONDecoder().raw_decode(text, key.end() - 1)  # behind the closing quotation mark
+        begins, ends = np.array(tokens["offset_mapping"]).reshape(-1, 2).T
+        found[:-1][(ends > key.end()) & (begins < end - 1)] = decision_weight
     return found
 
 

@@ -119,7 +119,6 @@ def weight_files(path: Path) -> dict[str, Path]:
 
 def pick_device(wanted: Device) -> str:
     """Return the device to use: `cuda` if there is one, unless the settings say otherwise."""
-    require("torch")
     import torch
 
     if wanted == "cuda" and not torch.cuda.is_available():
@@ -207,6 +206,7 @@ def load_student(
     """
     require("torch", "transformers", "peft")
     weight_files(path)
+    log.info("loading the student %s", path)
     import torch
     from peft import PeftModel, load_peft_weights
     from transformers import AutoConfig, AutoModelForCausalLM, AutoModelForImageTextToText, AutoTokenizer

@@ -41,14 +41,12 @@ def writing_errors(path: Path) -> Iterator[None]:
             raise OSError(int(found[1]), os.strerror(int(found[1])), str(path)) from error
 
 
-def save_tensors(path: Path, tensors: Mapping[str, Any], metadata: dict[str, str] | None = None) -> None:
-    """Write tensors by name; the file appears when it is complete."""
+def save_tensors(path: Path, tensors: Mapping[str, Any]) -> None:
+    """Write tensors by name."""
     from safetensors.torch import save_file
 
-    partial = path.with_name(f"{path.name}.partial")
     with writing_errors(path):
-        save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, partial, metadata)
-        os.replace(partial, path)
+        save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, path)
 
 
 def write_student(student: Student, folder: Path, base: Path, base_name: str = "") -> None:
@@ -74,12 +72,7 @@ def write_student(student: Student, folder: Path, base: Path, base_name: str = "
         write_bytes(folder / TEMPLATE, student.template.encode())
     if adapters:
         (folder / "README.md").unlink(missing_ok=True)
-        write_adapter_facts(folder, base)
-
-
-def write_adapter_facts(folder: Path, base: Path) -> None:
-    """Write which base an adapter belongs to."""
-    write_model(folder / ADAPTER_FACTS, AdapterFacts(base_sha256=base_digests(base)), ADAPTER_FORMAT)
+        write_model(folder / ADAPTER_FACTS, AdapterFacts(base_sha256=base_digests(base)), ADAPTER_FORMAT)
 
 
 def base_digests(model: Path) -> dict[str, str]:

@@ -9,7 +9,10 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import os
 import resource
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -23,6 +26,7 @@ from cosfly.runtime.errors import ConfigError, InputError, ResumeError
 from cosfly.runtime.io import sha256_bytes, storage_errors
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.seeding import rng_for
+from cosfly.runtime.worker import LEFT_TO_THE_PARENT
 from distill.student.model import Student
 from distill.training.checkpoints import (
     Progress,
@@ -44,6 +48,8 @@ LOG, CHECKPOINTS = "log.jsonl", "checkpoints"
 LOGIT_CHUNK = 512  # answer tokens whose logits exist at a time
 MAX_GRADIENT_NORM = 1.0  # gradients are scaled down to this norm
 WARMUP_FRACTION = 0.03  # share of the steps with a rising learning rate
+SAVE_EVERY_S = 600.0  # most time between checkpoints, for steps that take minutes
+STOPPING = b"\ndistill.train: saves a checkpoint after this step, then ends; a second signal ends it at once\n"
 Note = Callable[[dict[str, Any]], None]
 
 
@@ -79,6 +85,22 @@ def learning_rate_at(cfg: TrainConfig, step: int, num_steps: int) -> float:
         return cfg.learning_rate * (step + 1) / warmup
     share = (step - warmup) / max(1, num_steps - warmup)
     return cfg.learning_rate * 0.5 * (1.0 + math.cos(math.pi * share))
+
+
+@contextlib.contextmanager
+def first_signal() -> Iterator[list[int]]:
+    """Collect the first Ctrl-C or SIGTERM instead of raising its exception; a second one is handled as before."""
+    received = list[int]()
+
+    def receive(number: int, _: object) -> None:
+        handlers.close()
+        received.append(number)
+        os.write(2, STOPPING)
+
+    with contextlib.ExitStack() as handlers:
+        for number in LEFT_TO_THE_PARENT if threading.current_thread() is threading.main_thread() else ():
+            handlers.callback(signal.signal, number, signal.signal(number, receive))
+        yield received
 
 
 @contextlib.contextmanager
@@ -164,8 +186,8 @@ def fit(context: TrainingContext, out: Path) -> Progress:
     if progress.samples != used:
         fix = "restore the pictures as they were, or choose another --out"
         raise ResumeError("other samples can be used than when the training began", where=out, fix=fix)
-    if progress.step:
-        log.info("%s: resumed after step %d", STAGE, progress.step)
+    words = f"resumed after step {progress.step}" if newest else "no checkpoint yet: begins with the first step"
+    log.info("%s: %s", STAGE, words)
     if accelerator.is_main_process:
         cut_log(out / LOG, progress.step if newest else -1)
     note = partial(_note, context, out / LOG)
@@ -186,8 +208,8 @@ def _take_steps(context: TrainingContext, optimizer: Any, progress: Progress, fo
     cfg, accelerator, lengths = context.cfg, context.accelerator, context.train.lengths
     first, start_s, mine = progress.step, time.monotonic(), (accelerator.process_index, accelerator.num_processes)
     num_steps, per_epoch = count_steps(cfg, len(lengths))
-    step_start_s = start_s
-    with progress_bar(STAGE, total=num_steps, done=first) as advance:
+    step_start_s = saved_s = start_s
+    with progress_bar(STAGE, total=num_steps, done=first) as advance, first_signal() as received:
         for step, numbers in enumerate(steps_from(cfg, len(lengths), context.seed, first), first):
             chosen = [context.train.used[number] for number in share_of(numbers, lengths, *mine)]
             rate = learning_rate_at(cfg, step, num_steps)
@@ -208,10 +230,16 @@ def _take_steps(context: TrainingContext, optimizer: Any, progress: Progress, fo
             if is_validated:
                 progress = validate(context, progress, note)
             is_last = done == num_steps or progress.has_ended
-            if accelerator.is_main_process and (is_last or is_validated or done % cfg.save_every_steps == 0):
+            is_stopped = context.total([len(received)]) != [0.0]  # all processes take the same steps
+            is_due = done % cfg.save_every_steps == 0 or now_s - saved_s > SAVE_EVERY_S
+            if accelerator.is_main_process and (is_last or is_validated or is_stopped or is_due):
                 save_checkpoint(folder, context.student, optimizer, progress)
                 drop_old_checkpoints(folder, progress, cfg.keep_checkpoints)
+                saved_s = now_s
             advance(1, f"loss {facts['loss']:.4f}, {speed['tokens_per_s']:.0f} tokens/s, {speed['memory_gb']:.1f} GB")
+            if is_stopped and not is_last:
+                log.info("%s: stopped after step %d, with a checkpoint", STAGE, done)
+                raise KeyboardInterrupt if signal.SIGINT in received else SystemExit(128 + signal.SIGTERM)
             if is_last:
                 break
             step_start_s = time.monotonic()

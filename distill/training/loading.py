@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,9 +16,9 @@ import numpy as np
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import CosflyError
 from cosfly.runtime.limits import memory_bytes, num_cpus
-from cosfly.runtime.worker import end_with_parent
+from cosfly.runtime.worker import LEFT_TO_THE_PARENT, end_with_parent
 from distill.schema import Sample
-from distill.student.chat import EncodedSample, FieldWeights, Processor, special_token_in
+from distill.student.chat import EncodedSample, Processor, special_token_in
 from distill.student.features import FramePicture, PictureReader, Tensors, encode, pictures_of, read_features
 from distill.student.model import Student
 from distill.training.settings import STAGE, TrainConfig
@@ -51,6 +52,8 @@ def _start_worker(parent_pid: int, _: int) -> None:
     import torch
 
     end_with_parent(parent_pid)  # a worker with a result would wait for a killed parent, and hold the folder's lock
+    for number in LEFT_TO_THE_PARENT:
+        signal.signal(number, signal.SIG_IGN)
     torch.set_num_threads(1)
     cv2.setNumThreads(0)
 
@@ -99,7 +102,7 @@ class TrainingSplit:
     samples: Sequence[Sample]
     processor: Processor
     max_pixels: int
-    weights: FieldWeights
+    decision_weight: float
     used: list[TrainingSample] = field(default_factory=list)
     skipped: defaultdict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
 
@@ -121,7 +124,7 @@ class TrainingSplit:
         sample = self.samples[place]
         if token := special_token_in(self.processor, sample):
             return "special_token", f"{sample.key}: a text contains {token}"
-        row = self.processor.encode(sample, self.max_pixels, self.weights)
+        row = self.processor.encode(sample, self.max_pixels, self.decision_weight)
         if len(row) > max_tokens:
             return "too_long", f"{sample.key}: {len(row)} tokens"
         return TrainingSample(place, row, tuple(pictures_of(sample)))

@@ -34,9 +34,6 @@ class TrainConfig(Config):
     decision_weight: float = Field(
         20.0, gt=0, le=1000, description="weight of the decision's tokens in the loss; other tokens have weight 1"
     )
-    reason_weight: float = Field(
-        1.0, ge=0, le=1000, description="weight of the tokens of the reasoning trace in the loss; 0: not learnt"
-    )
     chat_template: str = Field("", description="file with a chat template for a base model without one; empty: its own")
     allow_code: bool = Field(False, description="run code from the student's repository; only if you trust it")
     max_pixels: int = Field(

@@ -199,6 +199,7 @@ def run(
         ConfigError: the memory is full, or the loss is not finite.
     """
     require("torch", "transformers", "peft", "accelerate")
+    log.info("%s: loading packages", STAGE)
     from accelerate.utils import broadcast_object_list
 
     base_name = str(student) if is_hub_name(str(student)) else Path(student).absolute().name
@@ -263,8 +264,8 @@ def _context(
     check_template(student, samples[0])
     check_head(student)
     taught = taught_by(samples, cfg.max_pixels)  # its errors come before the training
-    weights = {"flight_decision": cfg.decision_weight, "reasoning_trace": cfg.reason_weight}
-    train, val = (TrainingSplit(part, student, cfg.max_pixels, weights) for part in (samples, validation))
+    given = student, cfg.max_pixels, cfg.decision_weight
+    train, val = (TrainingSplit(part, *given) for part in (samples, validation))
     order = rng_for(seed, STAGE, "validation").permutation(len(validation))
     train.encode(range(len(samples)), cfg.max_tokens, cfg.data_workers)
     val.encode(sorted(order[: cfg.validation_samples].tolist()), cfg.max_tokens, cfg.data_workers)
