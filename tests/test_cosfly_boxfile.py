@@ -65,6 +65,22 @@ def feature(kind: str, coordinates: list, **properties: object) -> dict:
     return {"type": "Feature", "properties": properties, "geometry": {"type": kind, "coordinates": coordinates}}
 
 
+def test_boxes_that_touch_and_pieces_of_one_outline_do_not_overlap(tmp_path, caplog):
+    """The rectangles around the pieces of a bent outline share ground; those of two turned houses do not."""
+    caplog.set_level("INFO")
+    bent = [[0, 0], [40, 0], [43, 9], [30, 12], [24, 20], [12, 31], [3, 40], [0, 22], [9, 14], [0, 0]]
+    diamonds = [[[x, 90], [x + 10, 100], [x, 110], [x - 10, 100], [x, 90]] for x in (0, 20, 40)]
+    side_by_side = [[[x, 60], [x + 10, 60], [x + 10, 70], [x, 70], [x, 60]] for x in (0, 10)]
+    shapes = [bent, *diamonds, *side_by_side]
+    kinds = {"type": "Buildings", "height_m": 9}
+    box_map = loaded(tmp_path, collection(*(feature("Polygon", [ring], **kinds) for ring in shapes)), ".geojson")
+    assert "0% overlap another" in caplog.messages[-1]
+    assert "0% overlap another" not in plausibility(box_map)  # each box as a row of its own
+    crossed = [*shapes, [[5, 62], [14, 62], [14, 68], [5, 68], [5, 62]]]
+    loaded(tmp_path, collection(*(feature("Polygon", [ring], **kinds) for ring in crossed)), ".geojson")
+    assert "0% overlap another" not in caplog.messages[-1]
+
+
 def test_outlines_and_points_of_geojson(tmp_path):
     angled = [[0, 0], [20, 0], [20, 5], [5, 5], [5, 20], [0, 20], [0, 0]]
     box_map = loaded(
@@ -228,6 +244,10 @@ def test_openstreetmap_and_overture_need_the_name_of_the_type_column(tmp_path, c
     assert (osm.header.num_objects, osm.header.dropped_objects) == (14, {"unmapped_type": 1})
     assert osm.header.extent_sources == {"file": 12, "default": 1, "levels": 1} | {"file": 13}
     assert "default 1" in caplog.text
+    of_ogr = [{**one, "properties": {"building": "yes", "other_tags": '"roof"=>"a \\"b\\"","height"=>"12 m"', "height": None}}
+              for one in houses(*at, DEGREES)]  # fmt: skip
+    box_map = loaded(tmp_path, collection(*of_ogr), ".geojson", type_column="building,highway,natural")
+    assert_allclose(2 * box_map.half_extents[:, 2], 12.0)
     overture = [{**one, "properties": {"id": f"08-{k}", "sources": [{}], "class": "house" if k else None,
                                        "num_floors": 3, "height": 11.5 if k % 2 else None}}
                 for k, one in enumerate(houses(*at, DEGREES))]  # fmt: skip

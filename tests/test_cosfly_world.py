@@ -160,6 +160,17 @@ def test_what_is_not_respected_is_named_in_the_report_and_in_one_line(tmp_path, 
     assert plan_by_rules(prompt, 0)[0].heights_m[1] < 20.0  # a control tower makes no city of towers
 
 
+def test_a_limit_of_houses_is_none_of_a_lighthouse_and_a_number_is_named_as_one(tmp_path, caplog):
+    prompt = "a small fishing town with a harbour, 20 houses up to 3 floors, a lighthouse and a square with 12 trees"
+    run(WorldConfig(prompt=prompt), tmp_path / "w")
+    (line,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert line == "words not used: fishing; numbers not used: 12 (of trees)"
+    plan, _ = plan_by_rules(prompt, 0)
+    assert plan.buildings[0].heights_m[1] <= 9.6
+    for all_of_it in ("no building higher than 3 floors", "up to 3 floors", "20 houses, nothing above 3 floors"):
+        assert plan_by_rules(f"a town with a lighthouse, {all_of_it}", 0)[0].highest_m == pytest.approx(9.6)
+
+
 def test_patterns_and_seeds_give_different_plans():
     """The share of ground that is street in both of two towns, of that which is in one, stays below 0.6."""
 

@@ -12,6 +12,7 @@ import csv
 import io
 import logging
 import math
+import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -38,6 +39,7 @@ from cosfly.maps.footprints import (
     cover,
     num_cuts,
     oriented_rectangle,
+    overlaps,
     polygons_of,
     with_derived_ground,
 )
@@ -65,6 +67,7 @@ TYPE_RULES = read_yaml(Path(__file__).with_name("feature_rules.yaml"))["rules"]
 GEOMETRIES = ("Point", "LineString", "Polygon", "MultiPoint", "MultiLineString", "MultiPolygon")  # of GeoJSON
 LARGEST_PLACE = 1e8  # absolute value of a coordinate of GeoJSON, in any unit
 MOST_NAME = 40  # characters of a name in messages
+HSTORE_TAG = re.compile(r'"([^"\\]+)"=>"([^"\\]*)"')
 LINE_M = 0.1  # farthest that a corner of a line may be moved
 SLAB_M = 0.3  # thickness of a surface without a height: its top is the ground
 STOREY_M, LANE_M = 3.0, 3.5
@@ -76,7 +79,6 @@ DEFAULT_SIZES_M = {
 }  # fmt: skip
 FAR_M = 10_000.0  # a map with its middle farther from the origin is moved there
 OUTLINE_FILL, OUTLINE_PIECE_M = 0.9, 3.0  # share of its boxes that an outline fills; shortest piece that is cut
-OVERLAP_M = 0.05  # boxes that share less than this only touch
 
 
 class BoxesConfig(Config):
@@ -165,7 +167,7 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
             where="maps.boxes",
             fix=f"remove {', '.join(f'maps.boxes.{name}' for name in sorted(of_tables))}",
         )
-    box_map = read_boxes(path) if suffix == ".json" else _read_rows(cfg, path, suffix)
+    box_map, rows = (read_boxes(path), []) if suffix == ".json" else _read_rows(cfg, path, suffix)
     settings = cfg.model_dump(include=cfg.model_fields_set & {"name", "licence", "credits"})
     source = MapSource(tool=box_map.header.source.tool or "boxes", file=path.name)
     header = box_map.header.model_copy(update={**settings, "source": source})
@@ -176,24 +178,27 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
         header = header.model_copy(update={"offset_m": dict(zip("xyz", origin.tolist(), strict=True))})
         box_map = replace(box_map, centers=box_map.centers - origin)
     box_map = replace(box_map, header=header)
-    log.info("%s: %s", path.name, plausibility(box_map))
+    log.info("%s: %s", path.name, plausibility(box_map, rows))
     return with_derived_ground(box_map) if cfg.derive_ground else box_map
 
 
-def plausibility(box_map: BoxMap) -> str:
-    """Return one line that shows a user mistaken units, axes and angles."""
+def plausibility(box_map: BoxMap, rows: Sequence[int] = ()) -> str:
+    """Return one line that shows a user mistaken units, axes and angles.
+
+    Args:
+        rows: The row of the file of each box: pieces of one outline do not overlap each other. Empty: one box a row.
+    """
     low, high = box_map.bounds()
-    solid = box_map.select(~box_map.is_any_of(SURFACE_KINDS))
+    is_solid = ~box_map.is_any_of(SURFACE_KINDS)
+    solid = box_map.select(is_solid)
     text = f"{len(box_map)} boxes, {' x '.join(f'{size:.6g}' for size in high - low)} m"
     if not len(solid):
         return text
     yaws_deg = solid.rotations_deg[:, 1]
     feet_m = solid.mins[:, 2] - solid.ground.height_at(solid.centers)
     heights_m = 2 * solid.half_extents[:, 2]
-    outlines = shapely.box(*(solid.mins[:, :2] + OVERLAP_M / 2).T, *(solid.maxs[:, :2] - OVERLAP_M / 2).T)
-    first, second = shapely.STRtree(outlines).query(outlines, predicate="intersects")
-    shared_m = np.minimum(*solid.maxs[[first, second], 2]) - np.maximum(*solid.mins[[first, second], 2])
-    overlapping = np.unique(first[(first != second) & (shared_m > OVERLAP_M)])
+    pairs, row_of_box = overlaps(solid), (np.array(rows) if len(rows) else np.arange(len(box_map)))[is_solid]
+    overlapping = np.unique(pairs[np.ptp(row_of_box[pairs], axis=1) > 0])
     return (
         f"{text}; obstacles {heights_m.min():.4g} to {heights_m.max():.4g} m high, bases {feet_m.min():.4g} to "
         f"{feet_m.max():.4g} m above the ground, yaw {yaws_deg.min():.4g} to {yaws_deg.max():.4g} degrees, "
@@ -201,7 +206,8 @@ def plausibility(box_map: BoxMap) -> str:
     )
 
 
-def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
+def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> tuple[BoxMap, list[int]]:
+    """Return the boxes of a table or of features, and the row of each."""
     rows, units = (_table_rows(cfg, path), cfg.units) if suffix == ".csv" else _feature_rows(cfg, path)
     if not rows:
         raise InputError("the file has no boxes", where=path, expected="at least one row or feature with a box")
@@ -246,8 +252,8 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
         update["extent_sources"] = dict(sources)
     box_map = boxes.box_map(header.model_copy(update=update))
     if ids and len(set(row_of_box)) == len(box_map):  # no row became several boxes
-        return replace(box_map, ids=np.array([ids[k] for k in row_of_box], dtype=np.uint64))
-    return box_map
+        box_map = replace(box_map, ids=np.array([ids[k] for k in row_of_box], dtype=np.uint64))
+    return box_map, row_of_box
 
 
 def _in_metres(rows: list[_Row], units: Units, path: Path, *, is_table: bool) -> list[_Row]:
@@ -373,6 +379,8 @@ def _feature(item: Any, number: int) -> _Row:
     """Return a Feature or a bare geometry with its properties; `number` counts from 1."""
     item = item if isinstance(item, dict) else {}
     properties = item["properties"] if isinstance(item.get("properties"), dict) else {}
+    if isinstance(tags := properties.get("other_tags"), str):  # where ogr2ogr writes the rest of OpenStreetMap's tags
+        properties = dict(HSTORE_TAG.findall(tags)) | {name: v for name, v in properties.items() if v is not None}
     values = {OTHER_NAMES[name]: value for name, value in properties.items() if name in OTHER_NAMES}
     values |= {name: value for name, value in properties.items() if name not in OTHER_NAMES}
     where = f"feature {number}"

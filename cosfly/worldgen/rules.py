@@ -326,7 +326,14 @@ class _Reader:
             got = " ".join(match[0].strip() for match in limits.values())
             expected = "a lowest and a highest height, within 3 to 450 m"
             raise InputError("the range of building heights is impossible", where="PROMPT", got=got, expected=expected)
-        self.plan["highest_m"] = high
+        kinds = "|".join(
+            word for name, one in WORDS["buildings"].items() if name != "building" for word in _words(one["words"])
+        )
+        is_of_a_kind = any(  # as in "houses of up to 3 floors": a lighthouse may be higher
+            re.search(rf"\b(?:{kinds})(?:e?s)?(?: (?:of|with|are))? ?$", match.string[: match.start()])
+            for match in limits.values()
+        )
+        self.plan["highest_m"] = None if is_of_a_kind else high
         for one in (self.plan, *self.plan["buildings"]):
             least, most = one["heights_m"]
             most = min(most if high is None or "between" not in limits else high, high or 450.0)
@@ -385,7 +392,8 @@ class _Reader:
             for word in [*part.split(), "the"]:
                 if word in STOPS or word in ORDINARY or word.removesuffix("s") in ORDINARY:
                     if phrase and phrase != ["1"]:
-                        phrases.append(self._said(" ".join(phrase)))
+                        of = f" (of {self._said(word)})" if word not in STOPS and phrase[-1].isdigit() else ""
+                        phrases.append(self._said(" ".join(phrase)) + of)
                     phrase = []
                 elif word != "1" or phrase:
                     phrase.append(word)

@@ -21,6 +21,7 @@ from cosfly.geometry.grid import connected_parts, empty_grid, occupancy, surface
 from cosfly.llm.answers import AnswerBook, KeptAnswers
 from cosfly.llm.client import ChatClient, EndpointConfig
 from cosfly.llm.contract import NoAnswer, Reply, started
+from cosfly.maps.footprints import footprints, overlaps
 from cosfly.maps.simworld import PLACEHOLDER_CM
 from cosfly.runtime.config import Config, read_yaml, shipped
 from cosfly.runtime.errors import InputError, TeacherError
@@ -28,10 +29,10 @@ from cosfly.runtime.io import sha256_bytes, write_bytes
 from cosfly.runtime.json_io import FileFormat, validated, write_json, write_model
 from cosfly.runtime.model_json import find_object
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally, hold_folder
-from cosfly.viz.topview import TopView, draw_map, png_bytes
+from cosfly.viz.topview import HALO, TopView, draw_map, draw_text, png_bytes
 from cosfly.worldgen.plan import OBJECTS, PLAN_FORMAT, WorldPlan, assets
 from cosfly.worldgen.rules import plan_by_rules
-from cosfly.worldgen.town import CM_PER_M, Town, build, footprints, layout_nodes, of_kinds, placement_nodes, trees_of
+from cosfly.worldgen.town import CM_PER_M, Town, build, layout_nodes, of_kinds, placement_nodes, trees_of
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +44,6 @@ MOST_CHARACTERS = 2000  # of a prompt
 AT_THE_DOOR_M = 2.0  # from a building to the pavement that leads to it
 ROAD_COST = 20  # a metre of carriageway away from crossings costs as much as 20 m of pavement
 WALK_M = 100.0  # the longest pedestrian trajectory that must fit: app:simworld:step4 samples 50 to 100 m
-OVERLAP_M = 0.05  # buildings that share less only touch
 
 
 class WorldConfig(Config):
@@ -68,7 +68,7 @@ def check_world(town: Town, plan: WorldPlan) -> list[dict[str, Any]]:
     low, high = min(kind.heights_m[0] for kind in kinds), max(kind.heights_m[1] for kind in kinds)
     heights_m = houses.maxs[:, 2] if len(houses) else [low]
     checks = [
-        ("overlapping buildings", _num_overlaps(buildings), 0, 0),
+        ("overlapping buildings", len(overlaps(buildings)), 0, 0),
         ("buildings without a pavement", num_parts - num_reached, 0, 0),
         ("length of the largest walkable component, m", component_m, WALK_M, 1e5),
         ("walkable ground in it", component_share, 0.8, 1.0),
@@ -95,23 +95,17 @@ def _problems(checks: list[dict[str, Any]], town: Town, trace: dict[str, Any]) -
     """Return one line that names what of a prompt the world does not respect; empty where it respects all."""
     unmet = ["{check} ({got:g}, expected {least:g} to {most:g})".format(**one) for one in checks if not one["is_met"]]
     missing = Counter(f"{name} ({reason})" for name, reason in town.not_placed)
+    numbers = [phrase for phrase in trace["not_used"] if re.match(r"\d+ \(of ", phrase)]
     lists = {
         "not respected": trace.get("not_respected", []) + unmet,
         "not placed": [f"{number} x {name}" if number > 1 else name for name, number in missing.items()],
-        "words not used": trace["not_used"],
+        "words not used": [phrase for phrase in trace["not_used"] if phrase not in numbers],
+        "numbers not used": numbers,
     }
     parts = [f"{title}: {', '.join(names)}" for title, names in lists.items() if names]
     if not trace.get("settlement_is_named", True):
         parts.insert(0, f"no kind of place that the generator has is named, so this is a {trace['settlement']}")
     return "; ".join(parts)
-
-
-def _num_overlaps(boxes: BoxMap) -> int:
-    """Count pairs of boxes that share more than a sliver of space."""
-    outlines = shapely.buffer(footprints(boxes), -OVERLAP_M / 2, join_style="mitre")
-    first, second = shapely.STRtree(outlines).query(outlines, predicate="intersects")
-    shared_m = np.minimum(*boxes.maxs[[first, second], 2]) - np.maximum(*boxes.mins[[first, second], 2])
-    return int(((first < second) & (shared_m > OVERLAP_M)).sum())
 
 
 def _reach(box_map: BoxMap, buildings: np.ndarray) -> tuple[int, float, float]:
@@ -203,7 +197,11 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same
     said = {"not_respected": trace.get("not_respected", []), "words_not_used": plan.not_used}
     write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks, **said})
     view = TopView.around(np.stack(town.boxes.bounds()), 1000)
-    write_bytes(out / "map.png", png_bytes(draw_map(town.boxes, view)))
+    picture = draw_map(town.boxes, view)
+    for number, block in enumerate(town.open_blocks):  # plazas first; their pavement is that of other blocks
+        name = "plaza" if number < plan.plazas else "green"
+        draw_text(picture, name, *view.pixels(np.array(block.centroid.coords))[0], align=0.5, halo=HALO)
+    write_bytes(out / "map.png", png_bytes(picture))
     settings = read_yaml(shipped("simworld.yaml")) | {"name": "world"}  # those of the appendix, for this world
     world = {"name": cfg.name, "world": str(product.resolve()), "licence": OUR_LICENCE, "credits": CREDITS}
     settings["pedestrians"]["road_cost"] = ROAD_COST
