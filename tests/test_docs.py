@@ -18,6 +18,7 @@ from tables import each
 import cosfly
 from cosfly.cli import app
 from cosfly.pipeline.settings import RunConfig
+from release.columns import FRAME
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -115,6 +116,14 @@ def test_paths_exist(page):
     of_a_run = {"release/dataset/", "caption/answers/"}  # and not of the repository
     shown = set(re.findall(r"^```python\n# (\S+)$", text, re.MULTILINE))  # files that the page tells to make
     assert sorted(word for word in words - of_a_run - shown if not (ROOT / word).exists()) == []
+
+
+def test_the_files_page_has_every_column_of_a_release_with_its_fields():
+    rows = [line for line in (ROOT / "docs/files.md").read_text(encoding="utf-8").splitlines() if line[:1] == "|"]
+    for column in FRAME:
+        fields = column.type if isinstance(column.type, tuple) else ()
+        own = [set(re.findall(r"\w+", row)) for row in rows if re.search(rf"`{column.name}`", row)]
+        assert any(words >= set(fields) for words in own), f"{column.name}: {fields}"
 
 
 def test_every_file_of_the_files_page_is_written_by_code():
