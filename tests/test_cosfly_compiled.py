@@ -57,4 +57,4 @@ def test_compiling_is_told_once_and_loading_is_not(tmp_path):
         ).stderr
         for _ in range(2)
     ]
-    assert (said[0].count("compiling kernels, once"), said[1]) == (1, "")
+    assert (said[0].count("compiling kernels of __main__, once"), said[1]) == (1, "")

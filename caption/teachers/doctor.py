@@ -41,13 +41,13 @@ ODD_SCHEMA = {
     "required": ["animal", "legs"],
     "additionalProperties": False,
 }
-NUM_REQUESTS = 6  # of an examination without a failure
+NUM_REQUESTS = 6  # of an examination without a failure: two of them are about pictures, one about the schema
 MAX_SHOWN = 200  # characters of an answer
 MIN_TOKENS = 64  # the smallest `max_tokens`
 BLOCK_PX = 8  # the JPEG of a random picture with such blocks takes 44 kB at 640 x 360 px, a rendered frame 49 to 57 kB
 PADDING = "Nothing has to change. " * 100  # makes a prompt longer by several hundred tokens
 READY = "Reply with the one word: ready"
-NO_THINKING = "endpoint.extra_body={chat_template_kwargs: {enable_thinking: false}}"
+NO_THINKING = "caption.endpoint.extra_body={chat_template_kwargs: {enable_thinking: false}}"
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def examine_endpoint(
     Raises:
         TeacherError: The URL cannot be asked.
     """
-    with progress_bar("doctor", NUM_REQUESTS) as advance:
+    with progress_bar("doctor", NUM_REQUESTS - 2 * (not cfg.num_images) - (not cfg.endpoint.json_schema)) as advance:
         largest = largest_messages(cfg, vocabulary)
         examination = _Examination(ChatClient(url, cfg.endpoint), cfg, largest, advance, most_requests)
         return run_until_interrupted(examination.run(), keeps_work=False)
@@ -208,8 +208,8 @@ class _Examination:
         detail = f"{seconds:.1f} s for one answer to the largest prompt"
         if queued_s > endpoint.timeout_s:
             detail += (
-                f"; a server with one slot needs {queued_s:.0f} s for endpoint.concurrency={endpoint.concurrency} "
-                f"requests, more than endpoint.timeout_s={endpoint.timeout_s:g}, so a run begins with two requests and "
+                f"; a server with one slot needs {queued_s:.0f} s for caption.endpoint.concurrency={endpoint.concurrency} "
+                f"requests, more than caption.endpoint.timeout_s={endpoint.timeout_s:g}, so a run begins with two requests and "
                 "sends more only while answers are quick"
             )
         self._add("speed", "ok", detail)
@@ -233,12 +233,12 @@ def _problem_of(reply: Reply) -> str | None:
         return f"the model declines to answer: {text[:MAX_SHOWN]!r}"
     if text:
         return None
-    thoughts = "cut short at endpoint.max_tokens before the text begins, probably by thinking"
+    thoughts = "cut short at caption.endpoint.max_tokens before the text begins, probably by thinking"
     if reply.num_thoughts:
         thoughts = f"{reply.num_thoughts} characters of thinking and no answer"
     elif reply.finish_reason != "length":
         return "an empty answer"
-    return f"{thoughts}; switch thinking off with {NO_THINKING}, or raise endpoint.max_tokens"
+    return f"{thoughts}; switch thinking off with {NO_THINKING}, or raise caption.endpoint.max_tokens"
 
 
 def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary) -> list[dict]:

@@ -357,7 +357,8 @@ class ChatClient:
     def message_of(self, error: Exception) -> str:
         """Return the message of an exchange that failed."""
         if isinstance(error, TimeoutError | httpx.TimeoutException):
-            return f"no answer within {self.cfg.timeout_s:g} s"
+            more = "raise endpoint.timeout_s, such as --set caption.endpoint.timeout_s=600"
+            return f"no answer within {self.cfg.timeout_s:g} s ({more})"
         return self._clean(f"{type(error).__name__} {error}")
 
     def _clean(self, text: str) -> str:

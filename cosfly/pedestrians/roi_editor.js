@@ -233,7 +233,7 @@ function update() {
   for (const node of document.querySelectorAll("[data-say]")) node.textContent = say(node.dataset.say);
   for (const one of byId("backdrop").options) one.textContent = say(one.value);
   document.documentElement.lang = state.language;
-  byId("language").textContent = state.language === "en" ? "中文" : "English";
+  byId("language").textContent = state.language === "en" ? "ZH" : "EN";
   const open = openRing(), drawn = state.rings.length, chosen = state.ring >= 0 ? state.rings[state.ring] : null;
   byId("close").disabled = open < 0;
   byId("outer").disabled = byId("hole").disabled = open >= 0;

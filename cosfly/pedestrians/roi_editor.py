@@ -134,8 +134,8 @@ class Editor:
             "map": self.box_map.name, "most_bytes": MOST_BYTES, "axes": AXES, "roi": self.opened,
             "x_min": grid.x_min_m, "y_min": grid.y_min_m, "cell": grid.resolution_m, "size": grid.size,
             "grid": _encoded(levels), "levels": [OCCUPIED, MARGIN, UNUSED, FREE],
-            "alphas": [IN_REGION[3], WALKABLE[3]], "picture": self.backdrop and self.backdrop.frame(),
-            **self.cells(None),
+            "alphas": [IN_REGION[3], WALKABLE[3]], "walkable": (*WALKABLE[:3], WALKABLE[3] / 255),
+            "picture": self.backdrop and self.backdrop.frame(), **self.cells(None),
         }  # fmt: skip
         style = read_text(folder / "roi_editor.css")
         script = scripts("tools.js", "canvas.js") + read_text(folder / "roi_editor.js")

@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
 from cosfly.formats.boxes import BoxMap
+from cosfly.formats.episodes import Figure
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.formats.traces import DroneTrace, write_traces
 from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, PlanConfig, known_planner, planner_notes, title_of
@@ -330,7 +331,9 @@ def text_tables(product: Path) -> list[TextTable]:
     axes = []
     for name in AXES_AND_MEAN:
         intervals = [comparison["axis_differences"][other][name] for other in others]
-        differences = [f"{i['difference']:+.3f} ({i['low']:+.3f} to {i['high']:+.3f})" for i in intervals]
+        differences = [
+            Figure(value=i["difference"], low=i["low"], high=i["high"], count=0).shown("+.3f") for i in intervals
+        ]
         axes.append([name.replace("_", " "), *cells(comparison["axes"][p][name] for p in planners), *differences])
     rates = comparison["win_rates"]
     wins = [

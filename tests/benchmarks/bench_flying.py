@@ -3,7 +3,7 @@ steps a second an environment: alone, and two side by side in processes; and the
 
     python tests/benchmarks/bench_flying.py                     a town of our own, two workers, 640x360
     python tests/benchmarks/bench_flying.py --flights 8 --decisions 50 --rounds 3
-    python tests/benchmarks/bench_flying.py --envs --rounds 3   cosfly/Follow-v0, 640x360
+    python tests/benchmarks/bench_flying.py --envs --rounds 3   cosfly/Follow-v0, 640x360; --size 64 48 for another
     python tests/benchmarks/bench_flying.py --resets            all environments, 640x360
 
 Planning is done first and not counted; starting workers, maps, drawing and deciding are. Of an environment its steps
@@ -59,7 +59,7 @@ def time_resets(rounds: int) -> None:
         env.close()
 
 
-def time_envs(rounds: int) -> None:
+def time_envs(rounds: int, size_px: tuple[int, int]) -> None:
     import gymnasium
 
     from cosfly.envs.episodes import NUM_DECISIONS
@@ -70,7 +70,11 @@ def time_envs(rounds: int) -> None:
         for num in (1, 2):
             mode = "async" if num > 1 else "sync"
             envs = gymnasium.make_vec(
-                "cosfly/Follow-v0", num_envs=num, vectorization_mode=mode, vector_kwargs=how if num > 1 else {}
+                "cosfly/Follow-v0",
+                num_envs=num,
+                vectorization_mode=mode,
+                vector_kwargs=how if num > 1 else {},
+                size_px=size_px,
             )
             envs.reset(seed=SEED)
             envs.step([hover] * num)
@@ -91,10 +95,11 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--envs", action="store_true", help="steps of environments in place of flights")
+    parser.add_argument("--size", type=int, nargs=2, default=(640, 360), help="width and height of pictures of --envs")
     parser.add_argument("--resets", action="store_true", help="resets of environments in place of flights")
     asked = parser.parse_args()
     if asked.envs:
-        time_envs(asked.rounds)
+        time_envs(asked.rounds, tuple(asked.size))
         return
     if asked.resets:
         time_resets(asked.rounds)
