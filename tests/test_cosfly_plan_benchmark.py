@@ -206,3 +206,5 @@ def test_a_walk_that_one_planner_cannot_fly_is_counted(canyon, tmp_path, monkeyp
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
     assert manifest["counts"]["dropped"] == {"no_muco_trajectory": 1}
     assert {(row["id"], row["planner"]) for row in record["skipped"]} == {("into_wall", "all"), ("b", "muco")}
+    _, axes, _ = compare.text_tables(tmp_path / "out/compare.json")
+    assert not any("(" in row[-1] for row in axes.rows)  # one trajectory has no interval

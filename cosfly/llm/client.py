@@ -357,8 +357,7 @@ class ChatClient:
     def message_of(self, error: Exception) -> str:
         """Return the message of an exchange that failed."""
         if isinstance(error, TimeoutError | httpx.TimeoutException):
-            more = "raise endpoint.timeout_s, such as --set caption.endpoint.timeout_s=600"
-            return f"no answer within {self.cfg.timeout_s:g} s ({more})"
+            return f"no answer within {self.cfg.timeout_s:g} s; raise the limit, such as caption.endpoint.timeout_s=600"
         return self._clean(f"{type(error).__name__} {error}")
 
     def _clean(self, text: str) -> str:

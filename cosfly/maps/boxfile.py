@@ -183,11 +183,7 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
 
 
 def plausibility(box_map: BoxMap, rows: Sequence[int] = ()) -> str:
-    """Return one line that shows a user mistaken units, axes and angles.
-
-    Args:
-        rows: The row of the file of each box: pieces of one outline do not overlap each other. Empty: one box a row.
-    """
+    """Return one line that shows a user mistaken units, axes and angles. rows: that of each box in its file."""
     low, high = box_map.bounds()
     is_solid = ~box_map.is_any_of(SURFACE_KINDS)
     solid = box_map.select(is_solid)
@@ -290,9 +286,8 @@ def _units_of(rows: list[_Row], places: np.ndarray, units: Units, path: Path, *,
     if not sizes.any():  # points only
         places = shapely.get_coordinates(shapes)
         points = shapely.points(places)
-        sizes = shapely.STRtree(points).query_nearest(points, exclusive=True, all_matches=False, return_distance=True)[
-            1
-        ]
+        near = {"exclusive": True, "all_matches": False, "return_distance": True}
+        _, sizes = shapely.STRtree(points).query_nearest(points, **near)
     seen = seen_units(places, sizes)
     if units == "auto" and seen is None:
         what, fix = "the coordinates may be metres or degrees", "pass --set maps.boxes.units=m, or degrees"

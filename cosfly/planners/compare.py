@@ -330,11 +330,10 @@ def text_tables(product: Path) -> list[TextTable]:
     figures.append(["planning time (ms)", *means_ms, *[""] * 2 * len(others)])
     axes = []
     for name in AXES_AND_MEAN:
-        intervals = [comparison["axis_differences"][other][name] for other in others]
-        differences = [
-            Figure(value=i["difference"], low=i["low"], high=i["high"], count=0).shown("+.3f") for i in intervals
-        ]
-        axes.append([name.replace("_", " "), *cells(comparison["axes"][p][name] for p in planners), *differences])
+        found = [comparison["axis_differences"][other][name] for other in others]
+        differences = [Figure(value=one["difference"], low=one["low"], high=one["high"], count=0) for one in found]
+        scores = cells(comparison["axes"][p][name] for p in planners)
+        axes.append([name.replace("_", " "), *scores, *(one.shown("+.3f") for one in differences)])
     rates = comparison["win_rates"]
     wins = [
         [name.replace("_", " "), *(f"{rates[o][name]['count']} of {rates[o][name]['of']}" for o in others)]

@@ -70,12 +70,6 @@ class RenderConfig(WeatherConfig):
         "frames and actions at 10 Hz, 5 frames at 2 Hz with actions at 10 Hz",
     )
     debug: bool = Field(False, description="also write debug.png: boxes, ids and distances over the colours")
-    goal_least_px: int = Field(
-        24,
-        ge=1,
-        le=100_000,
-        description="a goal in words names a garment or the figure only where at least this many pixels show it, px",
-    )
     visible_threshold: float = Field(
         0.1,
         ge=0,

@@ -43,7 +43,8 @@ ENCODER_THREADS = 2  # of each worker, next to the drawing
 FRAMES_AHEAD = 6  # drawn but not written yet: bounds the memory (about 10 MB each)
 TOUCH_M = 0.01  # a camera this deep in a box still touches it only
 MOST_GOAL_FRAMES = 8  # the first in which the target is legible
-# Two appearances differ to the eye if enough pixels of the person differ in colour (`render.goal_least_px`).
+# Two appearances differ to the eye if enough pixels of the person differ in colour.
+GOAL_LEAST_PX = 24  # a goal in words names what at least this many pixels show
 DIFFERENT_SHARE = 0.04  # least share of the person's pixels
 DIFFERENT_CONTRAST = 10.0  # least difference of a pixel (CIE76)
 
@@ -338,7 +339,7 @@ def _with_goal(track: Track, renderer: Renderer, script: TrackScript, cfg: Rende
     legible = [i for i in range(len(track)) if track.legibility_at(i)["legible"]]
     for i in legible[:MOST_GOAL_FRAMES]:
         draw = partial(_draw_dressed, renderer, script, i, cfg.visible_threshold)
-        if goal := find_goal(people, i, draw, cfg.goal_least_px):
+        if goal := find_goal(people, i, draw, GOAL_LEAST_PX):
             return replace(track, goal=goal)
         advance()
     return replace(track, raw=track.raw | {"goal": {"absent": "not_told_apart" if legible else "never_legible"}})

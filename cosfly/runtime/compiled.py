@@ -50,9 +50,8 @@ class _SharedCache(caching.FunctionCache):
                     fcntl.flock(self._lock, fcntl.LOCK_EX)
             overload = super().load_overload(sig, target_context)  # another process may have compiled it meanwhile
             if overload is None:
-                module = self._py_func.__module__
                 words = "compiling kernels of %s, once on this machine (those of planning take about 30 s), into %s"
-                log.info(words, module, self.cache_path)
+                log.info(words, self._py_func.__module__, self.cache_path)
             else:
                 self._release_lock()
         return overload

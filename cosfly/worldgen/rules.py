@@ -326,14 +326,12 @@ class _Reader:
             got = " ".join(match[0].strip() for match in limits.values())
             expected = "a lowest and a highest height, within 3 to 450 m"
             raise InputError("the range of building heights is impossible", where="PROMPT", got=got, expected=expected)
-        kinds = "|".join(
+        kinds = [
             word for name, one in WORDS["buildings"].items() if name != "building" for word in _words(one["words"])
-        )
-        is_of_a_kind = any(  # as in "houses of up to 3 floors": a lighthouse may be higher
-            re.search(rf"\b(?:{kinds})(?:e?s)?(?: (?:of|with|are))? ?$", match.string[: match.start()])
-            for match in limits.values()
-        )
-        self.plan["highest_m"] = None if is_of_a_kind else high
+        ]
+        before = rf"\b(?:{'|'.join(kinds)})(?:e?s)?(?: (?:of|with|are))? ?$"
+        is_of_a_kind = any(re.search(before, match.string[: match.start()]) for match in limits.values())
+        self.plan["highest_m"] = None if is_of_a_kind else high  # a lighthouse is none of "houses of up to 3 floors"
         for one in (self.plan, *self.plan["buildings"]):
             least, most = one["heights_m"]
             most = min(most if high is None or "between" not in limits else high, high or 450.0)

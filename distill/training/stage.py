@@ -264,8 +264,7 @@ def _context(
     check_template(student, samples[0])
     check_head(student)
     taught = taught_by(samples, cfg.max_pixels)  # its errors come before the training
-    given = student, cfg.max_pixels, cfg.decision_weight
-    train, val = (TrainingSplit(part, *given) for part in (samples, validation))
+    train, val = (TrainingSplit(part, student, cfg.max_pixels, cfg.decision_weight) for part in (samples, validation))
     order = rng_for(seed, STAGE, "validation").permutation(len(validation))
     train.encode(range(len(samples)), cfg.max_tokens, cfg.data_workers)
     val.encode(sorted(order[: cfg.validation_samples].tolist()), cfg.max_tokens, cfg.data_workers)
