@@ -196,10 +196,8 @@ def generate(
     for tokens in found[:, num_prompt:].tolist():
         written = tokens[: tokens.index(end)] if end in tokens else tokens
         text = student.tokenizer.decode(written, skip_special_tokens=False).removeprefix(student.lead)
-        is_finished = end in tokens
-        if stop and stop in text:
-            text, is_finished = text.partition(stop)[0], True
-        completions.append(Completion(text, len(written), is_finished))
+        text, stopped, _ = text.partition(stop) if stop else (text, "", "")
+        completions.append(Completion(text, len(written), end in tokens or bool(stopped)))
     return completions
 
 
