@@ -62,8 +62,12 @@ def test_both_languages_of_a_sentence_agree():
 
 
 def test_a_caption_has_few_facts_a_reason_and_known_values(facts):
-    for i, one in enumerate(facts):
-        english, chinese = write_templates(one, random_bytes(0, "rules", str(i)))
+    written = [write_templates(one, random_bytes(0, "rules", str(i))) for i, one in enumerate(facts)]
+    assert sum(answer is not None for answer in written) >= 0.6 * len(facts)
+    for one, answer in zip(facts, written, strict=True):
+        if answer is None:
+            continue
+        english, chinese = answer
         assert english["flight_decision"] == chinese["flight_decision"]
         assert english["flight_decision"] in ranked(one)
         for name in FIELDS:
@@ -75,9 +79,9 @@ def test_a_caption_has_few_facts_a_reason_and_known_values(facts):
 
 
 def test_a_shaken_track_tells_no_motion_in_numbers(facts):
-    shaken = [one for one in facts if is_shaken(one)]
-    for one in shaken:
-        english, _ = write_templates(one, random_bytes(0, "rules", "shaken"))
+    written = [write_templates(one, random_bytes(0, "rules", "shaken")) for one in facts if is_shaken(one)]
+    assert any(written)
+    for english, _ in filter(None, written):
         assert not re.search(r"\{(change:|mean:target_speed|mean:speed|yaw\})", " ".join(english.values()))
 
 

@@ -72,7 +72,7 @@ def test_the_report_adds_up_and_repairs_stay_on_record(tree, tmp_path):
     assert not (done / "parts").exists()
 
 
-def test_who_cannot_be_made_out_changes_what_is_said_to_be_seen_and_no_decision(tree, done, tmp_path):
+def test_who_cannot_be_made_out_changes_what_is_said_to_be_seen_and_no_label(tree, done, tmp_path):
     before = list(read_captions(done / "captions.jsonl"))
     told = {}
     for legible in (True, False):
@@ -85,8 +85,10 @@ def test_who_cannot_be_made_out_changes_what_is_said_to_be_seen_and_no_decision(
         told[legible] = list(read_captions(run(CaptionConfig(), dim, tmp_path / f"out_{legible}")))
     assert [one.model_dump() for one in told[True]] == [one.model_dump() for one in before], "nothing is said anew"
     for one, other in zip(before, told[False], strict=True):
-        found = one.label, one.verdict, one.en.flight_decision
-        assert found == (other.label, other.verdict, other.en.flight_decision)
+        assert one.label == other.label
+        if one.en is None or one.en.flight_decision in ("ascend", "move_backward"):  # which make the person smaller
+            continue
+        assert (one.verdict, one.en.flight_decision) == (other.verdict, other.en.flight_decision)
         text, chinese = (getattr(other, language).critical_components for language in ("en", "zh"))
         if one.checks.values and "search" not in one.en.flight_decision:
             assert not re.search(r"visible|centred|middle|midline|border|edge|axis", text), text

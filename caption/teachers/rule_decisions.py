@@ -14,6 +14,7 @@ from caption.verification.facts import Facts
 
 HORIZON_S = 2.5  # over which motion is extrapolated
 LEAST_TURN_DEG, LEAST_CLIMB_M, LEAST_ADVANCE_M = 3.0, 1.0, 1.0  # that call for a manoeuvre
+WEAK = 0.5  # share of an expected manoeuvre that suggests it, where flying straight on is no answer
 SHAKEN_M, SHAKEN_GAP_M = 0.4, 1.0  # a larger second difference of altitude, of distance: the track is perturbed
 
 
@@ -89,13 +90,14 @@ def decide(f: Facts) -> str:
 
 
 def ranked(f: Facts) -> list[str]:
-    """Return the decisions that the observed frames lead to, that of `decide` first."""
+    """Return the decisions that the observed frames lead to, that of `decide` first, then those that they suggest."""
     first = decide(f)
     if f.mission is not None or not f.is_visible_now:
         return [first]
     sizes = expected_sizes(f)
     others = sorted((token for token in sizes if sizes[token] >= 1.0), key=sizes.__getitem__, reverse=True)
-    return list(dict.fromkeys([first, *others, "track_straight"]))
+    weak = [token for token in sizes if WEAK <= sizes[token] < 1.0 and token not in ("slow_down", "speed_up")]
+    return list(dict.fromkeys([first, *others, "track_straight", *sorted(weak, key=sizes.__getitem__, reverse=True)]))
 
 
 def _strongest(sizes: dict[str, float]) -> str:
