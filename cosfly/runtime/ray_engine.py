@@ -1,6 +1,6 @@
 """Stages on a Ray cluster: an actor on a node with free resources starts a worker process and relays its messages.
 
-Ray finds the node, carries bytes and reports lost nodes. `worker_pool` decides when a worker counts as stalled and what
+Ray finds the node, carries bytes and reports lost nodes. `pool` decides when a worker counts as stalled and what
 is tried again, as for the processes of one machine. Ray transfers no files: the nodes share the folder of the stage and
 its inputs. Workers receive one item at a time, and no frame passes through Ray.
 """

@@ -1,6 +1,6 @@
 """A worker process: works on the items that it receives through a pipe, and ends with its parent.
 
-`worker_pool` is at the other end of the pipe.
+`pool` is at the other end of the pipe.
 """
 
 from __future__ import annotations
