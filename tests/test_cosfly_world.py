@@ -19,10 +19,10 @@ from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import read_json, read_model
 from cosfly.runtime.run_dir import read_manifest
-from cosfly.worldgen.patterns import PATTERNS
 from cosfly.worldgen.plan import OBJECTS, PLAN_FORMAT, WorldPlan
 from cosfly.worldgen.rules import plan_by_rules
 from cosfly.worldgen.stage import WorldConfig, check_world, run
+from cosfly.worldgen.streets import PATTERNS
 from cosfly.worldgen.town import build, of_kinds
 
 PROMPTS = list(csv.DictReader(Path(__file__).with_name("world_prompts.tsv").open(), delimiter="\t"))

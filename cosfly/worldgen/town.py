@@ -25,9 +25,8 @@ from cosfly.maps.boxlist import SLAB_M, BoxList
 from cosfly.maps.footprints import Rectangle, footprints, oriented_rectangle, polygons_of, rectangle_polygon
 from cosfly.runtime.seeding import rng_for
 from cosfly.simulators.assets import ASSETS
-from cosfly.worldgen.patterns import QUAY_M, network
 from cosfly.worldgen.plan import VERGE_M, Buildings, Object, Range, WorldPlan, assets
-from cosfly.worldgen.streets import GROUND_TOP_M, lay_streets, pave
+from cosfly.worldgen.streets import GROUND_TOP_M, QUAY_M, lay_streets, network, pave
 
 CM_PER_M = 100.0
 ROAD_PIECE_M = 200.0  # length of SimWorld's piece of road
