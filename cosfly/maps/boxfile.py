@@ -27,10 +27,10 @@ import shapely.errors
 from pydantic import Field, field_validator
 from shapely.geometry import LineString, Point, Polygon, shape
 
-from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource, read_boxes
+from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, MapHeader, MapSource, read_boxes
 from cosfly.formats.columns import LARGEST
 from cosfly.formats.kinds import GROUND_KINDS, KINDS, SURFACE_KINDS
-from cosfly.maps.boxlist import WIDEST_M, BoxList, SkippedEntries, listed, origin_m, required
+from cosfly.maps.boxlist import WIDEST_M, BoxList, MapLicence, MapName, SkippedEntries, listed, origin_m, required
 from cosfly.maps.footprints import (
     CUT_SHARES,
     THINNEST_M,
@@ -84,9 +84,7 @@ OUTLINE_FILL, OUTLINE_PIECE_M = 0.9, 3.0  # share of its boxes that an outline f
 class BoxesConfig(Config):
     """Boxes of your own."""
 
-    name: str = Field(
-        "Boxes", min_length=1, description="name of the map, with which folder names in the playback tree begin"
-    )
+    name: MapName = "Boxes"
     path: Path | None = Field(None, description="boxes_3d.json, .csv or .geojson file; docs/maps.md lists the columns")
     units: Units = Field(
         "auto",
@@ -108,9 +106,7 @@ class BoxesConfig(Config):
     ignore: list[str] = Field([], description="columns or properties to ignore; ['*']: all unknown ones")
     ground_z_m: float = Field(0.0, description="height of the flat ground, in the file's coordinates, m")
     derive_ground: bool = Field(False, description="derive streets, pavements and lawn from the buildings")
-    licence: LicenceId = Field(
-        UNKNOWN_LICENCE, description="licence of the boxes, as spelled on the Hugging Face Hub (cc-by-4.0)"
-    )
+    licence: MapLicence = UNKNOWN_LICENCE
     credits: str = Field("", description="attribution of the map's makers, in one or more sentences")
 
     @field_validator("types")

@@ -1,4 +1,4 @@
-"""What the map sources share: the list of boxes that they fill, the file that they read, the origin of a map."""
+"""What the map sources share: settings, the list of boxes that they fill, the origin of a map."""
 
 from __future__ import annotations
 
@@ -7,16 +7,28 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
-from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map
+from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, make_box_map
 from cosfly.formats.kinds import KINDS
 from cosfly.runtime.errors import MOST_NAMED, ConfigError, InputError, counts_text
 from cosfly.runtime.io import over_limit
 
 log = logging.getLogger(__name__)
 
+# Settings of several sources.
+MapName = Annotated[
+    str, Field(min_length=1, description="name of the map, with which folder names in the playback tree begin")
+]
+MapLicence = Annotated[
+    LicenceId, Field(description="licence, as spelled on the Hugging Face Hub (cc-by-4.0); copied to every release")
+]
+GroundHeight = Annotated[
+    float | None, Field(description="height of the ground, m; null: the median height of road surfaces")
+]
 Pair = Sequence[float] | np.ndarray  # x and y
 WIDEST_M = 20_000.0  # of a map
 # Tops of the surfaces, m. At least two centimetres apart: a depth buffer separates them at 300 m.

@@ -17,9 +17,9 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
+from cosfly.formats.boxes import BoxMap, MapHeader, MapSource, make_box_map
 from cosfly.formats.kinds import KINDS
-from cosfly.maps.boxlist import served
+from cosfly.maps.boxlist import GroundHeight, MapLicence, served
 from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.io import sha256_bytes
 from cosfly.simulators.carla_client import CarlaConfig, connect
@@ -38,13 +38,9 @@ class CarlaMapConfig(CarlaConfig):
     """The town of a running CARLA server."""
 
     name: str | None = Field(None, min_length=1, description="name of the map; null: the town's name")
-    licence: LicenceId = Field(
-        "cc-by-4.0", description="licence, as spelled on the Hugging Face Hub; copied to every release"
-    )
+    licence: MapLicence = "cc-by-4.0"
     credits: str = Field("CARLA Simulator, Computer Vision Center", description="attribution of the town's makers")
-    ground_z_m: float | None = Field(
-        None, description="height of the ground, m; null: the median height of road surfaces"
-    )
+    ground_z_m: GroundHeight = None
     # terrain or vegetation longer than this both ways is dropped and counted, m; low slabs stay
     huge_m: ClassVar[float] = 150.0
 

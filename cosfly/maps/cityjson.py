@@ -19,10 +19,10 @@ import shapely
 from pydantic import Field
 from shapely.geometry import Polygon
 
-from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, GroundGrid, LicenceId, MapHeader, MapSource
+from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, GroundGrid, MapHeader, MapSource
 from cosfly.formats.meshes import MESHES_FILE, Meshes, MeshRef
 from cosfly.geometry.ground import Ground
-from cosfly.maps.boxlist import BoxList, origin_m, required
+from cosfly.maps.boxlist import BoxList, MapLicence, MapName, origin_m, required
 from cosfly.maps.cityjson_file import CityObject, Surface, read_model
 from cosfly.maps.footprints import (
     CUT_SHARES,
@@ -44,13 +44,9 @@ log = logging.getLogger(__name__)
 class CityJsonConfig(Config):
     """A CityJSON city model."""
 
-    name: str = Field(
-        "CityJson", min_length=1, description="name of the map, with which folder names in the playback tree begin"
-    )
+    name: MapName = "CityJson"
     path: Path | None = Field(None, description="CityJSON file: .json or .city.jsonl, also gzipped")
-    licence: LicenceId = Field(
-        UNKNOWN_LICENCE, description="licence of the model, as spelled on the Hugging Face Hub (cc-by-4.0)"
-    )
+    licence: MapLicence = UNKNOWN_LICENCE
     credits: str = Field("", description="attribution of the model's makers, in one or more sentences")
     units: Literal["auto", "m", "ft", "us-ft"] = Field(
         "auto",

@@ -17,10 +17,10 @@ import numpy as np
 import shapely
 from pydantic import AliasPath, BaseModel, Field, FiniteFloat, field_validator
 
-from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource
+from cosfly.formats.boxes import BoxMap, MapHeader, MapSource
 from cosfly.formats.columns import LARGEST
 from cosfly.formats.kinds import KINDS
-from cosfly.maps.boxlist import BASE_TOP_M, PAINT_TOP_M, ROAD_TOP_M, SLAB_M, BoxList, required
+from cosfly.maps.boxlist import BASE_TOP_M, PAINT_TOP_M, ROAD_TOP_M, SLAB_M, BoxList, MapLicence, MapName, required
 from cosfly.maps.footprints import footprints
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
@@ -49,16 +49,12 @@ SURFACE_NODE = "Sidewalks_C"  # only worlds with their own surfaces have it
 class SimWorldConfig(Config):
     """A SimWorld city."""
 
-    name: str = Field(
-        "SimWorld", min_length=1, description="name of the map, with which folder names in the playback tree begin"
-    )
+    name: MapName = "SimWorld"
     world: Path | None = Field(None, description="world file, progen_world.json")
     sizes: list[Path] = Field(
         [], description="asset size tables, of which the first with an asset applies; empty: Bbox.json near the world"
     )
-    licence: LicenceId = Field(
-        "apache-2.0", description="licence, as spelled on the Hugging Face Hub; copied to every release"
-    )
+    licence: MapLicence = "apache-2.0"
     credits: str = Field("SimWorld, maitrix-org and contributors", description="attribution of the world's makers")
     unknown: Literal["error", "drop"] = Field(
         "error", description="assets without a kind or a size: fail, or drop them"

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from cosfly.formats.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
-from cosfly.maps.boxlist import BASE_TOP_M, SLAB_M, BoxList, Pair
+from cosfly.maps.boxlist import BASE_TOP_M, SLAB_M, BoxList, MapName, Pair
 from cosfly.maps.town_parts import (
     BLOCKS,
     RAILING_M,
@@ -70,9 +70,7 @@ PRESETS = {name: TownPlan(**fields) for name, fields in read_yaml(Path(__file__)
 class SyntheticConfig(Config):
     """The synthetic town."""
 
-    name: str = Field(
-        "SynthTown", min_length=1, description="name of the map, with which folder names in the playback tree begin"
-    )
+    name: MapName = "SynthTown"
     preset: str = Field("small_town", description=f"kind of town: {', '.join(PRESETS)}")
     size_m: float | None = Field(
         None, ge=80.0, le=4000.0, description="side of the square town, m; null takes the preset's"

@@ -18,9 +18,9 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
+from cosfly.formats.boxes import BoxMap, MapHeader, MapSource, make_box_map
 from cosfly.formats.kinds import KIND_NAMES, KINDS
-from cosfly.maps.boxlist import served
+from cosfly.maps.boxlist import GroundHeight, MapLicence, served
 from cosfly.maps.simworld import read_sizes
 from cosfly.runtime.errors import InputError, counts_text
 from cosfly.runtime.json_io import write_json
@@ -43,14 +43,10 @@ class UnrealCvMapConfig(UnrealCvConfig):
     """The level of a running UnrealCV server."""
 
     name: str | None = Field(None, min_length=1, description="name of the map; null: the level's name")
-    licence: LicenceId = Field(
-        "apache-2.0", description="licence, as spelled on the Hugging Face Hub; copied to every release"
-    )
+    licence: MapLicence = "apache-2.0"
     credits: str = Field("SimWorld, maitrix-org and contributors", description="attribution of the level's makers")
     sizes: list[Path] = Field([], description="asset size tables of SimWorld, of which the first with an asset applies")
-    ground_z_m: float | None = Field(
-        None, description="height of the ground, m; null: the median height of road surfaces"
-    )
+    ground_z_m: GroundHeight = None
     # objects longer than this both ways and higher than 2 m, landscapes, are dropped and counted, m
     huge_m: ClassVar[float] = 150.0
     most_default: float | None = Field(
