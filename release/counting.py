@@ -19,7 +19,6 @@ from pydantic import BaseModel
 
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.formats.weather import preset_token
-from cosfly.geometry.coverage import Coverage
 from cosfly.geometry.trajectory_metrics import ACCEL_RMS_MAX_MPS2, JERK_RMS_MAX_MPS3, smoothness_score
 from release.columns import CAPTION_FIELDS, COUNTED, LANGUAGES, VALUE_COLUMNS
 from release.reading import TrackRows, bounded, read_tracks
@@ -106,7 +105,6 @@ class TrackCount(BaseModel):
     motion: dict[str, float | None]
     sums: dict[str, Sum]
     counts: dict[str, Counts]
-    coverage: Coverage
     example: dict[str, str | None]
 
     @property
@@ -134,7 +132,6 @@ def count_track(frames: TrackRows, points: TrackRows) -> TrackCount:
     first, rows = frames.rows[0], frames.rows
     offsets_m = frames.pose[:, :3] - frames.target_m
     clean_m = offsets_m - frames.drone_offset[:, :3] + frames.target_offset
-    heights_px = frames.mask_box[:, 3] - frames.mask_box[:, 1]
     fovs = frames.numbers("fov_deg")
     is_zooming = bool((np.abs(fovs - fovs[0]) > SAME_FOV_DEG).any())
     captioned = [row for row in rows if row["has_caption"]]
@@ -145,16 +142,12 @@ def count_track(frames: TrackRows, points: TrackRows) -> TrackCount:
         "visibility": frames.visibility,
         **{name: np.array([len(text) for text in own], float) for name, own in texts.items()},
     }  # fmt: skip
-    covered = np.column_stack([offsets_m, frames.numbers("target_heading_deg"), heights_px, frames.visibility])
-    named = [[row[name] for row in rows if row[name] is not None] for name in ("style", "pace", "label")]
-    skies = [[preset_token(row[name]) for row in rows if row[name] is not None] for name in ("weather", "time_of_day")]
     return TrackCount(
         name=frames.name, **{name: first[name] for name in ("track", "split", "walk", "pair")}, frames=len(rows),
         points=len(points), frames_digest=frames_digest(frames.index),
         fov="changing" if is_zooming else f"{round(bounded(first['fov_deg']), 1):g}", motion=_motion(points),
         sums={name: Sum.of(values.tolist()) for name, values in measured.items()},
         counts={name: dict(counter) for name, counter in _counts(frames, points, captioned).items()},
-        coverage=Coverage.of(covered, TARGET_HEIGHT_M, *named, *skies),
         example={name: captioned[0][name] for name in ("sample_id", *CAPTION_FIELDS)} if captioned else {},
     )  # fmt: skip
 
@@ -245,7 +238,6 @@ def numbers_of(tracks: Sequence[TrackCount], num_frames: int) -> Numbers:
         frames=sum(track.frames for track in tracks), flights=len(tracks), trajectories=len(trajectories),
         flights_shorter_than_num_frames=sum(track.frames < num_frames for track in tracks), counts=counts,
         spreads={name: own.spread() for name, own in spreads.items()},
-        coverage=Coverage.total(track.coverage for track in tracks),
         example=next((track.example for track in tracks if track.example), {}),
     )  # fmt: skip
 

@@ -12,13 +12,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile
 from cosfly.formats.inspection import TrajectoryFunnel
 from cosfly.formats.town import TownMap
-from cosfly.geometry.coverage import Coverage
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import FileFormat, read_model, write_model
 from release.columns import SPLIT_NAMES, SplitName
 
-RELEASE_FORMAT = FileFormat("cosfly.release", "6.1", "release record")
+RELEASE_FORMAT = FileFormat("cosfly.release", "7.0", "release record")
 RECORD = "release.json"
 
 Counts = dict[str, int]
@@ -184,7 +183,6 @@ class Numbers(Strict):
     flights_shorter_than_num_frames: int
     counts: dict[str, Counts]
     spreads: dict[str, Spread]
-    coverage: Coverage
     example: dict[str, str | None]
 
     def of(self, name: str) -> Counter[str]:

@@ -1,6 +1,5 @@
-"""What a run covers, and what its decisions can be told from without a picture."""
+"""What decisions can be told from without a picture."""
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -8,16 +7,11 @@ import pytest
 from benchmarks.bench_blind import is_drawn_ahead
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from markupsafe import escape
 
-from cosfly.formats.playback import read_track
 from cosfly.formats.segments import Segment
-from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import rotation_matrices
-from cosfly.geometry.coverage import AXES, Coverage, azimuths_deg
 from cosfly.inspection.blind_baseline import past_of
-from cosfly.viz.coverage_page import coverage_html, ranges, shares
-from specimens import make_flight, make_playback_tree
+from specimens import make_flight
 
 NUM = 12
 
@@ -95,46 +89,3 @@ def test_turns_and_other_parts_are_drawn_ahead_and_bends_and_orders_are_not():
     nobody = replace(parts, targets_m=np.full((NUM, 3), np.nan))
     assert is_drawn_ahead(nobody, 4, 9, False) is None
     assert is_drawn_ahead(parts, 0, 5, False) is None
-
-
-@pytest.fixture(scope="module")
-def flights(tmp_path_factory):
-    tree = make_playback_tree(tmp_path_factory.mktemp("tree"), 2, 12, width_px=64, height_px=36)
-    return [read_track(folder) for folder in find_tracks(tree)]
-
-
-def test_azimuths_count_from_the_walkers_heading_to_the_left():
-    offsets = {(10, 0): 0, (0, 10): 90, (-10, 0.001): 180, (0, -10): -90, (7, 7): 45}
-    for heading, ((x, y), azimuth) in itertools.product((0.0, 90.0, -135.0), offsets.items()):
-        turn = np.radians(heading)
-        turned = [x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn), 20.0]
-        found = azimuths_deg(np.array([turned]), np.array([heading]))[0]
-        assert (found - azimuth + 180) % 360 - 180 == pytest.approx(0, abs=0.1)
-
-
-def coverage_of(flight):
-    offsets_m = flight.positions_m - flight.targets_m
-    seen = [offsets_m, flight.target_headings_deg, np.full(len(flight), 20.0), flight.target.visibility]
-    return Coverage.of(np.column_stack(seen), 0.9, flight.styles, [flight.pace] * len(flight))
-
-
-def test_flights_add_up(flights):
-    parts = [coverage_of(flight) for flight in flights]
-    total = Coverage.total(parts)
-    assert total.frames == sum(len(flight) for flight in flights)
-    assert sum(total.styles.values()) == sum(total.paces.values()) == total.frames
-    heights = np.concatenate([f.positions_m[:, 2] - f.targets_m[:, 2] for f in flights]) + 0.9
-    low, high = total.range_of("height_m")
-    assert low == pytest.approx(np.quantile(heights, 0.05), abs=2.0)
-    assert high == pytest.approx(np.quantile(heights, 0.95), abs=2.0)
-    assert all(sum(total.bins[name]) == total.frames for name in ("height_m", "distance_m"))
-    assert Coverage.total([]).frames == 0
-
-
-def test_each_is_told_beside_the_plain_run(flights):
-    total = Coverage.total([coverage_of(flight) for flight in flights])
-    page = coverage_html(total)
-    assert all(str(escape(axis.title)) in page for axis in AXES.values())
-    assert {row[0] for row in shares(total, "styles")} == {"follow"}
-    assert shares(total, "labels") == []  # nobody captioned them
-    assert all(plain != "-" for _, _, plain in ranges(total))

@@ -74,7 +74,7 @@ def stats(
     folder: Annotated[Path, Argument(help="Release directory, or a run directory.")],
     out: Annotated[Path, Option(help="Folder for stats.html and stats.json.")],
 ) -> None:
-    """Draw the tables of a release, as the paper has them, and what it covers."""
+    """Draw the tables of a release, as the paper has them."""
     typer.echo(job.call("release.card.tables", folder, out))
 
 

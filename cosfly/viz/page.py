@@ -40,11 +40,6 @@ def scripts(*names: str) -> str:
     return "".join(read_text(Path(__file__).with_name("templates") / name) for name in names)
 
 
-def fragment(template: str, **values: Any) -> str:
-    """Return a part of a page, which another template prints without escaping."""
-    return Markup(_environment().get_template(template).render(**values))
-
-
 def markdown(template: str, **values: Any) -> str:
     """Return a page of Markdown from a template, by its path relative to the folder of the packages."""
     return _environment(is_markdown=True).get_template(template).render(**values)

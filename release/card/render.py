@@ -13,10 +13,8 @@ from typing import Any
 import yaml
 
 from cosfly.formats.captions import FIELDS, TOKENS
-from cosfly.geometry.coverage import NAMED
 from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.io import read_text
-from cosfly.viz.coverage_page import ranges, shares
 from cosfly.viz.page import markdown
 from release.card.tables import shown, tables_of
 from release.record import FRAMES_FOLDER, POINTS_FOLDER, ReleaseRecord, SourceRecord, shard_pattern
@@ -45,8 +43,6 @@ def render_card(record: ReleaseRecord) -> str:
         is_whole=all(one.frames == one.frames_available for one in record.flights),
         tables=tables_of(record),
         shown=shown,
-        ranges=ranges(numbers.coverage),
-        shares={kind: shares(numbers.coverage, kind) for kind in NAMED},
         fields=FIELDS,
         never_decided=[name for name in TOKENS if name not in decided],
         most_decided=max(decided.items(), key=lambda pair: pair[1], default=("none", 0)),

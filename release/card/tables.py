@@ -18,7 +18,6 @@ from cosfly.geometry.trajectory_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN
 from cosfly.llm.answer_text import MIN_CHARACTERS, MIN_CHARACTERS_ZH
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import Record, write_json
-from cosfly.viz.coverage_page import coverage_html
 from cosfly.viz.page import page
 from release.columns import CAPTION, LANGUAGE_NAMES, LANGUAGES
 from release.counting import ACTION_CLASSES, REVIEW_BELOW, STATES, TAB
@@ -270,11 +269,10 @@ def run(dataset: Path, out: Path) -> Path:
     write_json(out / "stats.json", {
         "name": record.name, "runs": runs, "content_digest": record.content_digest,
         "tables": [table.model_dump(mode="json") for table in tables],
-        "coverage": record.numbers.coverage.model_dump(mode="json"),
     })  # fmt: skip
     text = page(
         "release/card/stats.html", title=", ".join(runs) or record.name, style=STYLE, record=record, tables=tables,
-        coverage=coverage_html(record.numbers.coverage), look=TABLE_LOOK,
+        look=TABLE_LOOK,
     )  # fmt: skip
     write_bytes(out / "stats.html", text.encode())
     return out / "stats.html"
