@@ -6,8 +6,7 @@ import pytest
 from pydantic import BaseModel, Field
 
 from cosfly.pipeline.command_settings import SECTIONS
-from cosfly.pipeline.settings import RunConfig
-from cosfly.pipeline.settings_guide import explain, nested
+from cosfly.pipeline.settings import RunConfig, explain, nested
 from cosfly.runtime.config import Config, load
 from cosfly.runtime.errors import ConfigError
 

@@ -2,8 +2,7 @@
 
 import pytest
 
-from cosfly.pipeline.figure_places import FigureReader, MissingFile
-from cosfly.pipeline.reproduce import OF_RELEASE, read_paper
+from cosfly.pipeline.reproduce import OF_RELEASE, FigureReader, MissingFile, read_paper
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.json_io import write_json

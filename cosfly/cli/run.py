@@ -72,7 +72,7 @@ def print_run(run: Path, *, with_settings: bool = False) -> None:
     from cosfly.formats.inspection import how_to_decide
     from cosfly.pipeline.runs import PAGES, summarize
     from cosfly.pipeline.runs import in_words as size
-    from cosfly.pipeline.settings_guide import changed
+    from cosfly.pipeline.settings import changed
     from cosfly.runtime.json_io import dump_json
 
     summary = summarize(run)
@@ -185,22 +185,21 @@ def config_show(
     """Print the resolved configuration: every setting with its value."""
     import yaml
 
-    from cosfly.pipeline import settings_guide
-    from cosfly.pipeline.settings import RunConfig
+    from cosfly.pipeline import settings
     from cosfly.runtime.config import shipped
 
     if section is None and config is not None:
         path = Path(config)
         is_config = path.is_file() or (path / "run.yaml").exists() or shipped(f"{path.name}.yaml").exists()
-        is_section = config.partition(".")[0] in RunConfig.model_fields  # also where a folder has this name
+        is_section = config.partition(".")[0] in settings.RunConfig.model_fields  # also where a folder has this name
         if not is_config and (is_section or not (path.exists() or path.suffix in (".yaml", ".yml"))):
             config, section = None, config
     cfg = options.resolve(None if config is None else Path(config), overrides)
-    explained = (settings_guide.changed if changed else settings_guide.explain)(cfg, section)
+    explained = (settings.changed if changed else settings.explain)(cfg, section)
     if describe:
-        options.print_lines(settings_guide.as_lines(explained))
+        options.print_lines(settings.as_lines(explained))
     else:
-        values = settings_guide.nested(explained)
+        values = settings.nested(explained)
         typer.echo(yaml.safe_dump(values, sort_keys=False, allow_unicode=True), nl=False)
 
 
