@@ -27,7 +27,7 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.geometry.axes import CORNER_SIGNS, rotation_matrices
 from cosfly.planners import compare
-from cosfly.planners.compare import AXES, AXES_AND_MEAN, FIGURES, NAMES, CompareConfig, Means, PlannedItem, interval
+from cosfly.planners.compare import AXES, AXES_AND_MEAN, FIGURES, NAMES, CompareConfig, FiniteMeans, PlannedItem
 from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, planner_notes, title_of
 from cosfly.planners.overview import color_of
 from cosfly.runtime.errors import EnvironmentMissing
@@ -40,8 +40,7 @@ from cosfly.viz.tables import TextTable, cells
 
 log = logging.getLogger(__name__)
 
-FORMAT = FileFormat("cosfly.plan_benchmark", "1.0", "benchmark of planners")
-NO_TRAJECTORY = {"five_ray_mean": 0.0, "blocked_fraction": 1.0, "collision_fraction": 1.0, "clearance_min_m": 0.0}
+FORMAT = FileFormat("cosfly.plan_benchmark", "2.0", "benchmark of planners")
 GROUPS = {
     "our own": ("foresight",),
     "target-aware": ("track_astar", "muco"),
@@ -143,69 +142,33 @@ def _without_missing(cfg: BenchmarkConfig) -> BenchmarkConfig:
 
 
 def summarize(planned: dict[str, PlannedItem], planners: tuple[str, ...], rng: np.random.Generator) -> dict[str, Any]:
-    """Return the tables of `benchmark.json`.
+    """Return the tables of `benchmark.json`: those of a comparison, and the paper's ranking and groups.
 
-    Args:
-        planned: id of a pedestrian trajectory -> the planners' trajectories. rng: draws scenarios for the intervals.
+    `deltas` are those of the paper's pair, TA*+Smooth minus MuCO; none if one of them found no trajectory.
     """
-    traces = [item.read_traces(path_id) for path_id, item in planned.items()]
-    figures = {
-        planner: [compare.trajectory_figures(found[planner]) if planner in found else None for found in traces]
-        for planner in planners
-    }
-    tables = {planner: np.array([_table_row(row) for row in rows]) for planner, rows in figures.items()}
-    means = compare.mean_figures(tables)
-    both_found = all(planner in means and np.isfinite(list(means[planner].values())).all() for planner in PAIR)
-    return {
-        "scenarios": list(planned),
-        "infeasible": {path_id: item.errors for path_id, item in planned.items() if item.errors},
-        "figures": figures,
-        "means": {planner: _finite(row) for planner, row in means.items()},
-        "shortest_mean_m": round(compare.shortest_mean_m(means), 4),
-        "axes": _axes(tables, rng),
-        "deltas": compare.deltas(*(means[planner] for planner in PAIR)) if both_found else {},
-        "ranking": _ranking(means),
-        "groups": _groups(means),
-    }
+    tables = compare.summarize(planned, planners, rng)
+    means = tables["means"]
+    both_found = all(name in means and None not in means[name].values() for name in PAIR)
+    deltas = compare.deltas(*(means[name] for name in PAIR)) if both_found else {}
+    return tables | {"deltas": deltas, "ranking": _ranking(means), "groups": _groups(means)}
 
 
-def _axes(tables: dict[str, np.ndarray], rng: np.random.Generator) -> dict[str, dict[str, Any]]:
-    """Return the axis scores of each planner, and their intervals over scenarios."""
-    scores, *resampled_scores = compare.drawn_scores(tables, rng)  # the first without resampling
-    return {
-        planner: {
-            "scores": row,
-            "intervals": {axis: interval([resampled[planner][axis] for resampled in resampled_scores]) for axis in row},
-        }
-        for planner, row in scores.items()
-    }
-
-
-def _groups(means: Means) -> dict[str, dict[str, Any]]:
+def _groups(means: FiniteMeans) -> dict[str, dict[str, Any]]:
     """Return the number of planners of each group, and the means of their mean figures."""
     groups = {}
     for group, members in GROUPS.items():
         rows = [list(means[planner].values()) for planner in members if planner in means]
         if rows:
-            figures = dict(zip(NAMES, np.mean(rows, axis=0), strict=True))
-            groups[group] = {"num_planners": len(rows), "figures": _finite(figures)}
+            figures = dict(zip(NAMES, np.array(rows, dtype=np.float64).mean(axis=0), strict=True))
+            groups[group] = {"num_planners": len(rows), "figures": compare.finite(figures)}
     return groups
 
 
-def _table_row(figures: dict[str, float] | None) -> list[float]:
-    """Return the figures of one trajectory in the order of NAMES; NaN where a missing trajectory has none."""
-    return [(figures or NO_TRAJECTORY).get(name, np.nan) for name in NAMES]
-
-
-def _finite(figures: dict[str, float]) -> dict[str, float | None]:
-    return {name: round(float(value), 4) if np.isfinite(value) else None for name, value in figures.items()}
-
-
-def _ranking(means: Means) -> dict[str, dict[str, Any]]:
+def _ranking(means: FiniteMeans) -> dict[str, dict[str, Any]]:
     """Return rank, weighted score and criteria from 0, the worst, to 1, the best; 1 where there is no difference."""
     columns = []
     for figure, more_is_better, _ in CRITERIA.values():
-        values = np.array([row[figure] for row in means.values()])
+        values = np.array([row[figure] for row in means.values()], dtype=np.float64)
         is_finite = np.isfinite(values)
         low = values[is_finite].min()
         span = np.ptp(values[is_finite])
@@ -253,11 +216,11 @@ def _measured(benchmark: dict[str, Any], planner: str, *names: str) -> list[str]
 def _axes_table(benchmark: dict[str, Any]) -> TextTable:
     columns = ["visibility", "efficiency", "smoothness", "safety", "mean", "95 %", "paper", "collision", "clearance"]
     shortest = f"{benchmark['shortest_mean_m']:.2f} m (paper: {PAPER_SHORTEST_M} m)"
-    by_mean = sorted(benchmark["axes"].items(), key=lambda entry: -entry[1]["scores"]["mean"])
+    by_mean = sorted(benchmark["axes"].items(), key=lambda entry: -entry[1]["mean"])
     return TextTable(f"Four axes; efficiency relative to the shortest mean, {shortest}", ["planner", *columns], [
         [
-            title_of(planner), *cells(row["scores"][axis] for axis in AXES_AND_MEAN),
-            " to ".join(cells(row["intervals"]["mean"])), *_printed(planner, "axes_mean"),
+            title_of(planner), *cells(row[axis] for axis in AXES_AND_MEAN),
+            " to ".join(cells(benchmark["intervals"][planner]["mean"])), *_printed(planner, "axes_mean"),
             *_measured(benchmark, planner, "collision_fraction", "clearance_min_m"),
         ]
         for planner, row in by_mean
@@ -289,9 +252,10 @@ def _ranking_table(benchmark: dict[str, Any]) -> TextTable:
 
 def _feasibility_table(benchmark: dict[str, Any]) -> TextTable:
     rows = []
-    for planner, figures in benchmark["figures"].items():
-        fractions = [found["collision_fraction"] for found in figures if found]
-        counts = [f"{count} of {len(figures)}" for count in (len(fractions), fractions.count(0.0))]
+    scenarios = benchmark["scenarios"]
+    for planner in benchmark["means"]:
+        fractions = [scenario[planner]["collision_fraction"] for scenario in scenarios if scenario[planner]]
+        counts = [f"{count} of {len(scenarios)}" for count in (len(fractions), fractions.count(0.0))]
         measured = _measured(benchmark, planner, "collision_fraction", "five_ray_mean", "clearance_min_m")
         printed = _printed(planner, "num_free", "visibility", "clearance_m")
         rows.append([title_of(planner), GROUP_OF[planner], *counts, *measured, *printed])
@@ -360,7 +324,7 @@ def _radar(figure: Any, benchmark: dict[str, Any]) -> None:
     plot = figure.add_subplot(projection="polar")
     angles = np.arange(len(AXES)) * 2.0 * np.pi / len(AXES)
     for planner in primary or benchmark["axes"]:
-        scores = benchmark["axes"][planner]["scores"]
+        scores = benchmark["axes"][planner]
         style = {"edgecolor": _color(planner), "lw": 2.0, "label": f"{title_of(planner)}: mean {scores['mean']:.3f}"}
         plot.fill(angles, [scores[name] for name in AXES], facecolor="none", **style)
     plot.set_xticks(angles, [name.replace("_", " ") for name in AXES])
@@ -371,13 +335,12 @@ def _radar(figure: Any, benchmark: dict[str, Any]) -> None:
 def _bars(figure: Any, benchmark: dict[str, Any]) -> None:
     """Draw the four axes and their mean as bars with intervals, next to the mean that the paper prints."""
     plot = figure.add_subplot()
-    rows = list(benchmark["axes"].values())
-    places = np.arange(len(rows))
+    places = np.arange(len(benchmark["axes"]))
     width = 0.8 / len(AXES_AND_MEAN)
     shades = ("#3a6ea5", "#8fb8de", "#7fb069", "#e6aa68", "#303030")
     for k, (name, shade) in enumerate(zip(AXES_AND_MEAN, shades, strict=True)):
-        values = np.array([row["scores"][name] for row in rows])
-        spans = np.array([row["intervals"][name] for row in rows])
+        values = np.array([scores[name] for scores in benchmark["axes"].values()])
+        spans = np.array([intervals[name] for intervals in benchmark["intervals"].values()])
         whiskers = np.clip([values - spans[:, 0], spans[:, 1] - values], 0.0, None)
         style = {"yerr": whiskers, "error_kw": {"lw": 0.8}, "color": shade, "label": name.replace("_", " ")}
         plot.bar(places + (k - 2) * width, values, width, **style)
@@ -394,9 +357,9 @@ def _pairs(figure: Any, benchmark: dict[str, Any]) -> None:
     """Draw the planners as points in each pair of axes."""
     for place, (x_axis, y_axis) in enumerate(itertools.combinations(AXES, 2), 1):
         plot = figure.add_subplot(2, 3, place)
-        for planner, row in benchmark["axes"].items():
+        for planner, scores in benchmark["axes"].items():
             style = {"ms": 8, "label": title_of(planner)} if planner in PLANNERS else {"ms": 5}
-            plot.plot(row["scores"][x_axis], row["scores"][y_axis], "o", color=_color(planner), **style)
+            plot.plot(scores[x_axis], scores[y_axis], "o", color=_color(planner), **style)
         plot.set(xlabel=x_axis.replace("_", " "), ylabel=y_axis.replace("_", " "))
         plot.margins(0.2)
         plot.grid(alpha=0.3)
@@ -430,9 +393,10 @@ def _trajectories(figure: Any, benchmark: dict[str, Any], planned: dict[str, Pla
     """Draw the scenarios in which the visibility of TA*+Smooth exceeds that of MuCO most."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+    scenarios = {scenario["id"]: scenario for scenario in benchmark["scenarios"]}
+
     def gain(path_id: str) -> float:
-        scenario = benchmark["scenarios"].index(path_id)
-        first, second = (benchmark["figures"][planner][scenario] or {} for planner in PAIR)
+        first, second = (scenarios[path_id][planner] or {} for planner in PAIR)
         return first.get("five_ray_mean", 0.0) - second.get("five_ray_mean", 0.0)
 
     for place, path_id in enumerate(sorted(planned, key=gain, reverse=True)[:NUM_SHOWN], 1):

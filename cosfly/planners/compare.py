@@ -33,7 +33,7 @@ from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.worker import Item, Outcome, Work
 from cosfly.viz.tables import TextTable, cells
 
-FORMAT = FileFormat("cosfly.plan_compare", "2.1")
+FORMAT = FileFormat("cosfly.plan_compare", "2.2")
 CLEARANCE_SCALE_M = 5.0  # a clearance of this or more is full safety
 
 # Figures of one trajectory, in the order of the tables: name, title, digits.
@@ -51,11 +51,13 @@ FIGURES = (
     ("clearance_min_m", "min signed clearance (m)", 2),
 )
 NAMES = [name for name, _, _ in FIGURES]
+NO_TRAJECTORY = {"five_ray_mean": 0.0, "blocked_fraction": 1.0, "collision_fraction": 1.0, "clearance_min_m": 0.0}
 AXES = ("visibility", "path_efficiency", "smoothness", "safety")
 AXES_AND_MEAN = (*AXES, "mean")
 NUM_RESAMPLES, INTERVAL_PERCENT = 1000, (2.5, 97.5)  # of pedestrian trajectories, for intervals (Efron 1979)
 
 Means = dict[str, dict[str, float]]  # planner -> mean figures or scores
+FiniteMeans = dict[str, dict[str, float | None]]
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
@@ -124,9 +126,8 @@ def deltas(first: dict[str, float], second: dict[str, float]) -> dict[str, dict[
     return table
 
 
-def win_rates(first: list[dict[str, float]], second: list[dict[str, float]]) -> dict[str, dict[str, float]]:
+def win_rates(pairs: Sequence[tuple[dict[str, float], dict[str, float]]]) -> dict[str, dict[str, float]]:
     """Count how often the first planner is strictly better (tab:appendix_h_tastar_muco_win_rates)."""
-    pairs = list(zip(first, second, strict=True))
     wins = {
         "visibility_higher": [a["five_ray_mean"] > b["five_ray_mean"] for a, b in pairs],
         "path_shorter": [a["length_m"] < b["length_m"] for a, b in pairs],
@@ -137,37 +138,54 @@ def win_rates(first: list[dict[str, float]], second: list[dict[str, float]]) -> 
     return {name: {"count": sum(w), "of": len(w), "rate": round(sum(w) / len(w), 4)} for name, w in wins.items()}
 
 
-def summarize(traces: dict[str, list[DroneTrace]], rng: np.random.Generator) -> dict:
-    """Compare drone trajectories for the same pedestrian trajectories.
+def summarize(planned: dict[str, PlannedItem], planners: Sequence[str], rng: np.random.Generator) -> dict[str, Any]:
+    """Compare planners on the same pedestrian trajectories.
 
     Args:
-        traces: planner -> at least one trace, the same pedestrian trajectories in the same order.
+        planned: id of a pedestrian trajectory -> the planners' trajectories. rng: draws scenarios for the intervals.
     Returns:
-        The tables of `compare.json`. `deltas`, `axis_differences` and `win_rates` are by the other planner: the first
-        planner's figures minus its own, and the first planner's wins.
+        The tables of the product. `deltas`, `axis_differences` and `win_rates` are by the other planner: the first
+        planner's figures minus its own, and the first planner's wins, where both found trajectories.
     """
-    first, *others = traces
-    figures = {planner: [*map(trajectory_figures, planner_traces)] for planner, planner_traces in traces.items()}
-    tables = {planner: np.array([list(row.values()) for row in rows]) for planner, rows in figures.items()}
-    means = {p: {name: round(mean, 4) for name, mean in row.items()} for p, row in mean_figures(tables).items()}
-    scores = drawn_scores(tables, rng)
+    first, *others = planners
+    found = {path_id: item.read_traces(path_id) for path_id, item in planned.items()}
+    scenarios: list[dict[str, Any]] = [
+        {"id": path_id, **{name: trajectory_figures(traces[name]) if name in traces else None for name in planners}}
+        for path_id, traces in found.items()
+    ]
+    tables = {name: np.array([_table_row(scenario[name]) for scenario in scenarios]) for name in planners}
+    means = mean_figures(tables)
+    measured, *resampled = drawn_scores(tables, rng)
 
     def difference(other: str, axis: str) -> dict[str, float]:
-        measured, *resampled = (score[first][axis] - score[other][axis] for score in scores)
-        low, high = interval(resampled)
-        return {"difference": round(measured, 4), "low": low, "high": high}
+        low, high = interval([scores[first][axis] - scores[other][axis] for scores in resampled])
+        return {"difference": round(measured[first][axis] - measured[other][axis], 4), "low": low, "high": high}
 
+    pairs = {other: [(row[first], row[other]) for row in scenarios if row[first] and row[other]] for other in others}
     return {
-        "means": means,
-        "deltas": {other: deltas(means[first], means[other]) for other in others},
-        "axes": axis_scores(means),
+        "scenarios": scenarios,
+        "infeasible": {path_id: item.errors for path_id, item in planned.items() if item.errors},
+        "means": {name: finite(row) for name, row in means.items()},
+        "shortest_mean_m": round(shortest_mean_m(means), 4),
+        "axes": measured,
+        "intervals": {
+            name: {axis: interval([scores[name][axis] for scores in resampled]) for axis in AXES_AND_MEAN}
+            for name in planners
+        },
+        "deltas": {other: deltas(means[first], means[other]) for other in others if pairs[other]},
         "axis_differences": {other: {axis: difference(other, axis) for axis in AXES_AND_MEAN} for other in others},
-        "win_rates": {other: win_rates(figures[first], figures[other]) for other in others},
-        "scenarios": [
-            {"id": trace.path_id, **{planner: rows[i] for planner, rows in figures.items()}}
-            for i, trace in enumerate(traces[first])
-        ],
+        "win_rates": {other: win_rates(pairs[other]) for other in others if pairs[other]},
     }
+
+
+def _table_row(figures: dict[str, float] | None) -> list[float]:
+    """Return the figures of one trajectory in the order of NAMES; NaN where a missing trajectory has none."""
+    return [(figures or NO_TRAJECTORY).get(name, np.nan) for name in NAMES]
+
+
+def finite(figures: dict[str, float]) -> dict[str, float | None]:
+    """Return rounded figures, None for those that are not finite."""
+    return {name: round(float(value), 4) if np.isfinite(value) else None for name, value in figures.items()}
 
 
 # --- stage ------------------------------------------------------------------------------------------------------------
@@ -270,15 +288,15 @@ def run(
     box_map, pedestrians, done, planned, header = plan_all(
         stage, cfg, simplified_map, paths, seed, workers=workers, watch=watch
     )
-    traces_by_path = [item.read_traces(path_id) for path_id, item in planned.items()]
-    traces = {name: [path_traces[name] for path_traces in traces_by_path] for name in cfg.planners}
     summary = {
-        "planners": {name: ALL_PLANNERS[name] for name in traces},
+        "planners": {name: ALL_PLANNERS[name] for name in cfg.planners},
         "notes": planner_notes(cfg.planners, cfg),
-        **summarize(traces, rng_for(seed, "plan_compare", "intervals")),
+        **summarize(planned, cfg.planners, rng_for(seed, "plan_compare", "intervals")),
         "skipped": _skipped(done),
     }
     write_json(product, {**FORMAT.header, **header, **summary})
+    found = [item.read_traces(path_id) for path_id, item in planned.items()]
+    traces = {name: [path_traces[name] for path_traces in found] for name in cfg.planners}
     outputs = [product, *(out / f"drone_trace_{name}.json" for name in traces), out / "compare_overlay.png"]
     for path, (name, planner_traces) in zip(outputs[1:], traces.items(), strict=False):
         write_traces(path, planner_traces, {**header, "planner": name})
