@@ -35,7 +35,7 @@ REASONS = {
     "decision_mismatch": "the reasoning leads to another action than the decision",
     "contradicted_value": "a number of the text contradicts the measured facts; see `checks.contradictions`",
     "invalid_slot": "a slot names no known fact of the window, or its braces, unit or side do not fit",
-    "no_reason": "no observed fact supports the given decision",
+    "no_reason": "no observed fact supports a decision, or the label in a regeneration",
     "bilingual": "the two languages do not say the same; see `checks.bilingual`",
 }
 

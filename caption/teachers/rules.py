@@ -33,7 +33,7 @@ STRIDE_M = 3.0  # the most that two people come nearer to each other between fra
 NEAR_M, COMING_M = 3.0, 6.0  # from the target to a bystander at its side, to one on the way to it
 MOST_DIFFERENCES = 1  # in appearance, of a person who is similar
 SLOW_MPS, SLIDING_MPS, CRAWLING_MPS, DRIFTING_MPS = 0.3, 0.5, 0.7, 0.2
-STILL_MPS, DAWDLING_MPS = 0.15, 0.5  # a slower pedestrian stands; moves slowly
+HALTED_MPS, STILL_MPS, DAWDLING_MPS = 0.05, 0.15, 0.5  # a slower pedestrian has stopped; stands; moves slowly
 TURNING_DPS, SLIGHT_DPS, CLIMBING_MPS = 1.0, 3.0, 0.2  # slower turns and climbs are not worth a sentence; are slight
 SIDES = (("left", "right"), ("left",), ("right",))  # by the side of the decision
 HIDDEN = ("occluded", "out_of_view")
@@ -132,7 +132,7 @@ def is_slower(f: Facts) -> bool:
 
 
 def sets_off(f: Facts, side: int) -> bool:
-    return hurries(f, side) and (f.target_speeds_mps[0] or 0.0) < DRIFTING_MPS
+    return hurries(f, side) and (f.target_speeds_mps[0] or 0.0) < STILL_MPS
 
 
 def stands(f: Facts, side: int) -> bool:
@@ -307,7 +307,7 @@ def is_opposed(f: Facts, name: str, side: int) -> bool:
                 side * last_deg < -1.0 and drift_deg < 0.0
             )
         case "slow_down":
-            return walk_mps > speed_mps or opens_m >= SLIDING_MPS or hurries(f, 0)
+            return walk_mps > max(0.0, speed_mps - SLIDING_MPS) or opens_m >= SLIDING_MPS or hurries(f, 0)
         case "speed_up":
             return walk_mps < speed_mps or opens_m <= -SLIDING_MPS
         case "strafe":
@@ -334,7 +334,7 @@ CONDITIONS: dict[str, Condition] = {
     "stands": stands,
     "lingers": lambda f, side: is_walk_known(f, side) and (f.target_speeds_mps[-1] or 0.0) < DAWDLING_MPS,
     "sets_off": sets_off, "turns": turns, "crosses": crosses, "comes": comes, "walks_away": walks_away, "walks": walks,
-    "slows": slows, "stops": lambda f, side: slows(f, side) and (f.target_speeds_mps[-1] or 0.0) < SLOW_MPS,
+    "slows": slows, "halts": lambda f, side: slows(f, side) and (f.target_speeds_mps[-1] or 0.0) < HALTED_MPS, "stops": lambda f, side: slows(f, side) and (f.target_speeds_mps[-1] or 0.0) < SLOW_MPS,
     "hurries": hurries, "off_centre": off_centre, "sight_turns": sight_turns, "swings_through_jitter": lambda f, side: is_shaken(f) and sight_turns(f, side),
     "crosses_sight": lambda f, side: crosses(f, side) and sight_turns(f, side),
     "off_axis": lambda f, side: sight_swings(f, side) and side * (f.bearing_deg[-1] or 0.0) >= 1.0,
