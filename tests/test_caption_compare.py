@@ -10,7 +10,7 @@ from tables import each
 
 from caption.schema import CaptionConfig, RepairConfig, WindowConfig
 from caption.stage import compare as compare_stage
-from caption.stage.compare import Trial, compare, comparison_rows, try_strategy
+from caption.stage.compare import Trial, compare, try_strategy
 from caption.stage.window_loop import caption_window
 from caption.stage.windows import cut_windows
 from caption.teachers.teacher import RuleTeacher
@@ -110,5 +110,4 @@ def test_a_comparison_by_hand():
     assert (found.asks_per_conflict, found.tokens_per_conflict, found.naturalness) == (2.0, 200.0, 0.625)
     nothing = compare("hint", trials[2:])
     assert (nothing.repaired, nothing.consistency, nothing.naturalness) == (0, 0.0, None)
-    rows = comparison_rows([found, nothing])
-    assert [row[:4] for row in rows] == [("hint", "2", "33.3 %", "62.5 %"), ("hint", "0", "0.0 %", "-")]
+    assert [one.row[:4] for one in (found, nothing)] == [("hint", "2", "33.3 %", "62.5 %"), ("hint", "0", "0.0 %", "-")]

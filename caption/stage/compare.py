@@ -31,6 +31,7 @@ from cosfly.runtime.json_io import write_json
 
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 RESULT = "compare_strategies.json"
+COLUMNS = ("strategy", "repaired", "consistency", "naturalness", "requests each", "tokens each")
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,13 @@ class Comparison:
     naturalness: float | None
     asks_per_conflict: float
     tokens_per_conflict: float
+
+    @property
+    def row(self) -> tuple[str, ...]:
+        """The row of a table of these COLUMNS."""
+        natural = "-" if self.naturalness is None else f"{100 * self.naturalness:.1f} %"
+        per_conflict = (f"{self.asks_per_conflict:.2f}", f"{self.tokens_per_conflict:.0f}")
+        return (self.strategy, str(self.repaired), f"{100 * self.consistency:.1f} %", natural, *per_conflict)
 
 
 def words_in_common(one: Coc, two: Coc) -> float:
@@ -158,21 +166,3 @@ async def try_strategy(
         reason = error.cause
     last, caption = loop.english.coc if reason is None else None, loop.caption
     return Trial(first, last, caption.verdict, caption.attempts - num_asks, caption.usage.total - tokens)
-
-
-COLUMNS = ("strategy", "repaired", "consistency", "naturalness", "requests each", "tokens each")
-
-
-def comparison_rows(comparisons: Sequence[Comparison]) -> list[tuple[str, ...]]:
-    """Return the rows of a table of these COLUMNS."""
-    return [
-        (
-            one.strategy,
-            str(one.repaired),
-            f"{100 * one.consistency:.1f} %",
-            "-" if one.naturalness is None else f"{100 * one.naturalness:.1f} %",
-            f"{one.asks_per_conflict:.2f}",
-            f"{one.tokens_per_conflict:.0f}",
-        )
-        for one in comparisons
-    ]

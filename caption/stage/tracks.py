@@ -16,7 +16,7 @@ from pathlib import Path
 from caption.schema import CaptionConfig, Window, WindowConfig
 from caption.stage.windows import current_frames, cut_windows
 from cosfly.formats.places import flight_ids, place_of
-from cosfly.formats.playback import Track, read_track
+from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.runtime.errors import InputError, VerifyError
 
@@ -47,22 +47,18 @@ class TrackInput:
     def windows(self, cfg: CaptionConfig) -> Iterator[Window]:
         """Yield the windows in order of time; InputError if the track or its clean twin cannot be read."""
         track = replace(read_track(self.folder, strict=False), given_id=self.name)
-        return islice(cut_windows(track, cfg.window, _twin_of(track)), self.max_windows)
+        try:
+            twin = read_twin(track)
+        except VerifyError as error:  # it has other frames
+            log.warning("caption: %s: the labels do not use the clean track: %s", track.flight_id, error)
+            twin = None
+        return islice(cut_windows(track, cfg.window, twin), self.max_windows)
 
     def guess_num_windows(self, cfg: WindowConfig) -> int:
         """Estimate the number of windows from the frame folders, without reading the track."""
         num_frames = sum(1 for _ in (self.folder / "frames_playback").glob("frame_*"))
         count = len(current_frames(num_frames, cfg))
         return count if self.max_windows is None else min(count, self.max_windows)
-
-
-def _twin_of(track: Track) -> Track | None:
-    """Read the clean twin of a perturbed track; one with other frames is skipped with a warning."""
-    try:
-        return read_twin(track)
-    except VerifyError as error:
-        log.warning("caption: %s: the labels do not use the clean track: %s", track.flight_id, error)
-        return None
 
 
 def find_inputs(cfg: CaptionConfig, data: Path) -> tuple[list[TrackInput], bool]:

@@ -20,7 +20,7 @@ from caption.answer_formats.formats import THEREFORE
 from caption.schema import CaptionConfig, ObservedFrame, ObservedWindow
 from caption.teachers.prompt_files import Vocabulary
 from caption.teachers.prompts import MAX_RETURNED_CHARACTERS, Correction, make_question, question_messages
-from cosfly.llm.answer_text import answer_schema
+from cosfly.llm.answer_text import answer_schema, object_schema
 from cosfly.llm.client import LEFT_OUT, ChatClient
 from cosfly.llm.contract import Reply, run_until_interrupted
 from cosfly.llm.protocol import MEANINGS, BadReply, Refusal
@@ -35,12 +35,7 @@ State = Literal["ok", "warning", "unusable"]
 
 MAX_COMPLAINT = 2000  # characters that a complaint hardly ever takes
 ODD_WORD = "zebra-41"  # what no model writes to a greeting unless it is made to
-ODD_SCHEMA = {
-    "type": "object",
-    "properties": {"animal": {"type": "string", "enum": [ODD_WORD]}, "legs": {"type": "integer", "enum": [7]}},
-    "required": ["animal", "legs"],
-    "additionalProperties": False,
-}
+ODD_SCHEMA = object_schema({"animal": {"type": "string", "enum": [ODD_WORD]}, "legs": {"type": "integer", "enum": [7]}})
 NUM_REQUESTS = 6  # of an examination without a failure: two of them are about pictures, one about the schema
 MAX_SHOWN = 200  # characters of an answer
 MIN_TOKENS = 64  # the smallest `max_tokens`
@@ -262,17 +257,13 @@ def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary) -> list[dict]:
 
     def draw(number: int) -> list[EncodedImage]:
         """Draw the pictures of a frame: random blocks, so that their files are as large as those of detailed frames."""
-        pictures = question.pictures
-        width_px, height_px = pictures.size_px
-        num_pictures, num_columns = len(pictures.views), 1
-        if pictures.layout == "tiled":
-            num_pictures, num_columns = 1, num_pictures
-        shape = (num_pictures, math.ceil(height_px / BLOCK_PX), math.ceil(num_columns * width_px / BLOCK_PX), 3)
+        width_px, height_px = question.pictures.size_px
+        shape = (len(question.pictures.views), math.ceil(height_px / BLOCK_PX), math.ceil(width_px / BLOCK_PX), 3)
         blocks = np.random.default_rng(number).integers(0, 256, shape, dtype=np.uint8)
-        large = blocks.repeat(BLOCK_PX, axis=1).repeat(BLOCK_PX, axis=2)
-        return [encoded_image(picture[:height_px, : num_columns * width_px]) for picture in large]
+        views = blocks.repeat(BLOCK_PX, axis=1).repeat(BLOCK_PX, axis=2)[:, :height_px, :width_px]
+        return [encoded_image(picture) for picture in question.pictures.arranged(list(views))]
 
-    return question_messages(question, [draw(number) if question.pictures.views else [] for number in range(count)])[0]
+    return question_messages(question, list(map(draw, range(count))))[0]
 
 
 def _user(text: str, pictures: list[dict] | None = None) -> dict:

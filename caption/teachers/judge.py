@@ -18,6 +18,7 @@ from caption.schema import JudgeConfig, Judgement
 from caption.teachers.prompt_files import Vocabulary
 from cosfly.formats.captions import Coc, JudgeRecord
 from cosfly.formats.places import flight_of
+from cosfly.llm.answer_text import object_schema
 from cosfly.llm.answers import AnswerBook, Budget, KeptAnswers
 from cosfly.llm.client import ChatClient, EndpointConfig
 from cosfly.llm.contract import NoAnswer, Request, started
@@ -62,14 +63,6 @@ def judge_messages(conflict: Conflict, vocabulary: Vocabulary, order: Sequence[J
     return [{"role": "system", "content": system}, {"role": "user", "content": user}]
 
 
-def judge_schema(order: Sequence[Judgement] = JUDGEMENTS) -> dict:
-    properties = {
-        "verdict": {"type": "string", "enum": list(order)},
-        "reason": {"type": "string", "minLength": 1, "maxLength": 600},
-    }
-    return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
-
-
 def parse_judgement(text: str, finish_reason: str | None = None) -> tuple[str, str]:
     """Return the verdict and the reason of the last object of a text; `unjudged` if either is missing."""
     found = find_object(text, ("verdict", "reason"), finish_reason)
@@ -93,7 +86,9 @@ class Judge:
     async def judge(self, conflict: Conflict, order: Sequence[Judgement] = JUDGEMENTS) -> JudgeRecord:
         """Return the verdict on a conflict, `unjudged` without a readable answer. BudgetSpent: A limit is reached."""
         messages = judge_messages(conflict, self.vocabulary, order)
-        request = Request(messages, [], judge_schema(order), self.sampling)
+        verdicts = {"type": "string", "enum": list(order)}
+        schema = object_schema({"verdict": verdicts, "reason": {"type": "string", "minLength": 1, "maxLength": 600}})
+        request = Request(messages, [], schema, self.sampling)
         try:
             reply = await self.kept.ask(request, flight_of(conflict.sample_id), conflict.sample_id, "judge")
         except NoAnswer as error:  # not journaled: a later run may ask again

@@ -108,12 +108,9 @@ def user_prompts(window: ObservedWindow, facts: Facts, vocabulary: Vocabulary) -
 
 def prompt_hash(question: Question) -> str:
     """Return the hash of a free question and its system prompts."""
-    standing = _hash_of([*[prompt.system for prompt in question.prompts.values()], teacher_prompt(question)])
-    users = [
-        prompt.user.replace(PICTURES_MARK, question.pictures.sentence(language))
-        for language, prompt in question.prompts.items()
-    ]
-    return _hash_of([standing, *users])[:16]
+    prompts = question.asked.values()
+    systems = _hash_of([*[prompt.system for prompt in prompts], teacher_prompt(question)])
+    return _hash_of([systems, *[prompt.user for prompt in prompts]])[:16]
 
 
 def _hash_of(texts: Sequence[str]) -> str:

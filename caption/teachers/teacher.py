@@ -80,7 +80,7 @@ def encode_frame(
     frame: Path, pictures: Pictures, encode: Callable[[np.ndarray], EncodedImage] = encoded_image
 ) -> list[EncodedImage]:
     """Return the pictures of one frame, one per view or a tiled one; InputError if a file cannot be read."""
-    return [encode(picture) for picture in pictures.read(frame)] if pictures.views else []
+    return [encode(picture) for picture in pictures.read(frame)]
 
 
 class AskingTeacher:

@@ -132,8 +132,8 @@ def compare_strategies(
     conflicts: Annotated[int, Option(min=1, help="Stop after this number of conflicts.")] = 50,
 ) -> None:
     """Compare hint, multi_sample, anchored and cascade on the same conflicts: consistency, text, requests, tokens."""
-    from caption.stage.compare import COLUMNS, comparison_rows
+    from caption.stage.compare import COLUMNS
 
     comparisons = job.call("caption.stage.compare", job.cfg.caption, job.tree(data), out, conflicts=conflicts)
     title = f"Regeneration of the same {comparisons[0].num_conflicts} conflicts"
-    options.print_table(COLUMNS, comparison_rows(comparisons), title)
+    options.print_table(COLUMNS, [one.row for one in comparisons], title)

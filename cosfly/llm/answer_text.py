@@ -53,7 +53,11 @@ def answer_schema(
     }
     properties |= more
     properties["flight_decision"] = {"type": "string", "enum": [decision] if decision else list(TOKENS)}
-    properties = {name: properties[name] for name in dict.fromkeys([*fields_in_order(place)[:1], *properties])}
+    return object_schema({name: properties[name] for name in dict.fromkeys([*fields_in_order(place)[:1], *properties])})
+
+
+def object_schema(properties: Mapping[str, dict]) -> dict:
+    """Return the JSON schema of an object with these fields and no other."""
     return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
 
 

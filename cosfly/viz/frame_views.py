@@ -52,7 +52,11 @@ class Pictures:
             picture = read_view(frame, view, max_side_px=max(self.size_px), depth_range_m=self.depth_range_m)
             self.check_size(frame_path(frame, VIEW_FILES[view]), (picture.shape[1], picture.shape[0]))
             pictures.append(picture)
-        return [np.hstack(pictures)] if pictures and self.layout == "tiled" else pictures
+        return self.arranged(pictures)
+
+    def arranged(self, views: list[np.ndarray]) -> list[np.ndarray]:
+        """Return the pictures of a frame from its views, each (h, w, 3): these, or one with all side by side."""
+        return [np.hstack(views)] if views and self.layout == "tiled" else views
 
     def check_size(self, file: Path, found_px: tuple[int, int]) -> None:
         """Check that a file of (width, height) gives pictures of `size_px`."""
