@@ -78,7 +78,7 @@ def test_strategies_ask_by_their_rungs(tree, tmp_path, strategy, rungs):
     ]
     assert [len(enum) for enum in schemas] == [1] * len(repaired) * ("anchored" in rungs)
     repair = report_of(tmp_path / "out")["repair"]
-    assert repair["rejected"] == sum(repair["rungs"].values()) == len(repaired)
+    assert repair["rejected"] == sum(repair["outcomes_by_strategy"][strategy].values()) == len(repaired)
 
 
 def test_the_key_reaches_the_header_and_nothing_else(tree, tmp_path, monkeypatch, caplog):

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from caption.schema import CaptionConfig, Window
-from caption.stage.ledger import explain_drops, most_common
+from caption.stage.ledger import explain_drops
 from caption.stage.tracks import TrackInput
 from caption.stage.window_loop import caption_window
 from caption.teachers.judge import open_judge
@@ -26,7 +26,7 @@ from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook, Budget, BudgetSpent
 from cosfly.llm.contract import STOP_AFTER_FAILURES, NoAnswer
 from cosfly.runtime.console import SECONDS_BETWEEN_LINES, Advance, duration, progress_bar
-from cosfly.runtime.errors import CosflyError, InputError, TeacherError
+from cosfly.runtime.errors import CosflyError, InputError, TeacherError, counts_text
 from cosfly.runtime.run_dir import Failed, StageFolder, Tally, read_failures, write_failures
 
 log = logging.getLogger(__name__)
@@ -50,6 +50,12 @@ class AskingOutcome:
     unanswered: list[Failed] = field(default_factory=list)
     stopped: str | None = None
     judge_usage: Usage | None = None
+
+    @property
+    def causes(self) -> str:
+        """Why windows have no answer, with their counts, and the last message."""
+        counts = counts_text(Counter(failure.code for failure in self.unanswered))
+        return f"{counts}; the last: {self.unanswered[-1].message}"
 
 
 class Asking:
@@ -212,7 +218,7 @@ class Asking:
         self.outcome.unanswered.append(failure)
         self.quarantine[failure.id] = failure
         self.progress.add(None)
-        self._count_failure(f"{common_causes(self.outcome.unanswered)}; the last: {failure.message}")
+        self._count_failure(self.outcome.causes)
 
     def _record_refusal(self, caption: Caption) -> None:
         """Keep a window that was refused or declined, or that did not fit the context, for `--retry-failed`."""
@@ -260,12 +266,6 @@ def read_quarantine(stage_path: Path) -> dict[str, Failed]:
     return {failure.id: failure for failure in read_failures(path)} if path.exists() else {}
 
 
-def common_causes(failures: list[Failed]) -> str:
-    """Return the three most common causes with their counts."""
-    causes = most_common(Counter(failure.code for failure in failures))
-    return ", ".join(f"{cause} {count}" for cause, count in list(causes.items())[:3])
-
-
 # --- progress ---------------------------------------------------------------------------------------------------------
 
 
@@ -277,8 +277,7 @@ class RunProgress:
         self.windows = Tally()  # of this run
         self.num_repaired = 0
         self._start_s = time.monotonic()
-        self._tokens_before = Counter(budget.totals)
-        self._spent_before = budget.spent
+        self._tokens_before = budget.totals
 
     def skip(self, num_windows: int) -> None:
         """Count windows of an earlier run."""
@@ -305,8 +304,7 @@ class RunProgress:
     def figures(self) -> str:
         """Return the figures of the run as a text."""
         budget, windows = self.budget, self.windows
-        tokens = Counter(budget.totals)
-        tokens.subtract(self._tokens_before)
+        tokens = budget.totals - self._tokens_before
         reasons = ", ".join(f"{reason} {count}" for reason, count in windows.dropped.most_common(4))
         rate_per_s = windows.input / max(time.monotonic() - self._start_s, 1e-9)
         figures = [
@@ -317,7 +315,7 @@ class RunProgress:
             f"{rate_per_s:.2f} windows/s",
         ]
         if budget.cfg.price_prompt or budget.cfg.price_completion:
-            figures.append(f"cost {budget.spent - self._spent_before:.2f}")
+            figures.append(f"cost {budget.cfg.cost(tokens['prompt_tokens'], tokens['completion_tokens']):.2f}")
         if windows.input:
             figures.append(f"{duration(self.num_left / rate_per_s)} left")
         return ", ".join(figures)

@@ -6,19 +6,21 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
+from pydantic import BaseModel, PlainSerializer
 
-from cosfly.formats.captions import TOKENS, Caption, Checks, TeacherRecord, Usage, ValueCounts
+from cosfly.formats.captions import TOKENS, Caption, TeacherRecord, Usage, ValueCounts
 from cosfly.formats.frames import frame_name
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import BudgetConfig
 from cosfly.runtime.io import read_text, sha256_bytes
+from cosfly.runtime.json_io import FileFormat
 from cosfly.runtime.run_dir import Tally
 from cosfly.viz.frame_views import thumbnail
 from cosfly.viz.page import page
 
+REPORT_FORMAT = FileFormat("cosfly.caption_report", "2.0", "caption report")
 NUM_CARDS = 24
 # The codes of `drop_reason` and their meanings, for messages and docs/captions.md.
 REASONS = {
@@ -53,60 +55,41 @@ def explain_drops(dropped: Mapping[str, int]) -> str:
 
 # --- the report -------------------------------------------------------------------------------------------------------
 
-
-def _by_name(counts: Mapping[str, Any]) -> dict[str, Any]:
-    return dict(sorted(counts.items()))
-
-
-def _by_token(confusion: Mapping[str, Mapping[str, int]]) -> dict[str, dict[str, int]]:
-    order = {token: i for i, token in enumerate((*TOKENS, "none"))}
-    labels = sorted(confusion, key=order.__getitem__)
-    return {label: dict(sorted(confusion[label].items(), key=lambda pair: order[pair[0]])) for label in labels}
-
-
 Counts = Annotated[Counter[str], PlainSerializer(most_common)]
 
 
 class RepairCounts(BaseModel, extra="forbid"):
-    """Counts of rejected answers. rungs: By the attempt that repaired them, or by the outcome if none did."""
+    """Counts of rejected answers. outcomes_by_strategy: By the attempt that repaired one, else the outcome."""
 
     rejected: int = 0
-    rungs: Counts = Counter()
-    outcomes_by_strategy: Annotated[dict[str, Counter[str]], PlainSerializer(_by_name)] = {}
-    asks: Annotated[Counter[str], PlainSerializer(_by_name)] = Counter()
+    outcomes_by_strategy: dict[str, Counts] = {}
+    asks: Counts = Counter()
 
 
-class CaptionReport(BaseModel):
+class CaptionReport(BaseModel, extra="forbid"):
     """`caption_report.json`: counts of captions, which are added one by one. Counts by a word are in falling order.
 
-    flights: Tracks. confusion: Label -> first decision -> count. values: Language -> values_filled, values_matched,
-    values_contradicted. writing: Of accepted captions. refusals: Of dropped windows, code -> last message of a server.
-    judge_tokens: Of all runs into the directory; not written if no judge was asked.
+    flights: Tracks. values: Language -> values_filled, values_matched, values_contradicted. writing: Of accepted
+    captions. refusals: Of dropped windows, code -> last message of a server. judge_tokens: Of all runs into the
+    directory; None if no judge was asked.
     """
 
-    model_config = ConfigDict(extra="forbid", populate_by_name=True)
-
-    schema_: Literal["cosfly.caption_report"] = Field("cosfly.caption_report", alias="schema")
-    schema_version: Literal["1.0"] = "1.0"
     teacher: TeacherRecord | None = None
     flights: Tally = Tally()
     windows: Tally = Tally()
     asks: int = 0
     tokens: Counts = Counter()
-    structured: Counts = Counter()
     verdicts_of_first_answers: Counts = Counter()
     verdicts_of_accepted: Counts = Counter()
     labels: Counts = Counter()
     label_from: Counts = Counter()
-    confusion: Annotated[dict[str, Counter[str]], PlainSerializer(_by_token)] = Field(
-        {}, alias="confusion_label_to_first_decision"
-    )
+    confusion_label_to_first_decision: dict[str, Counts] = {}
     repair: RepairCounts = RepairCounts()
     judgements: Counts = Counter()
     structure: Counts = Counter()
     bilingual: Counts = Counter()
     writing: Counts = Counter()
-    values: Annotated[dict[str, Counter[str]], PlainSerializer(_by_name)] = {}
+    values: dict[str, Counts] = {}
     contradicted_captions: int = 0
     recovered: Counts = Counter()
     refusals: dict[str, str] = {}
@@ -119,34 +102,33 @@ class CaptionReport(BaseModel):
             for code, message in self.refusals.items()
         ]
 
-    def as_json(self) -> dict:
-        return self.model_dump(mode="json", by_alias=True, exclude=set() if self.judge_tokens else {"judge_tokens"})
-
     def add(self, caption: Caption) -> None:
         """Count a caption."""
-        label, repair = caption.label or "none", caption.repair
+        label, repair, checks = caption.label or "none", caption.repair, caption.checks
         self.teacher = caption.teacher.model_copy(update={"structured": None})
         self.windows.input += 1
         self.asks += caption.attempts
         self.tokens.update(caption.usage.model_dump())
-        self.structured[caption.teacher.structured or "none"] += 1
         self.labels[label] += 1
         self.label_from[caption.label_from] += 1
         if caption.en is not None:
             self.verdicts_of_first_answers[str(repair.first_verdict if repair else caption.verdict)] += 1
             decision = repair.first_decision if repair else caption.en.flight_decision
-            self.confusion.setdefault(label, Counter())[decision] += 1
+            self.confusion_label_to_first_decision.setdefault(label, Counter())[decision] += 1
         if repair:
-            rung = repair.rung or repair.outcome
             self.repair.rejected += 1
-            self.repair.rungs[rung] += 1
             self.repair.asks[str(repair.asks)] += 1
-            self.repair.outcomes_by_strategy.setdefault(repair.strategy, Counter())[rung] += 1
+            self.repair.outcomes_by_strategy.setdefault(repair.strategy, Counter())[repair.rung or repair.outcome] += 1
         if caption.judge:
             self.judgements[caption.judge.verdict] += 1
             if caption.judge.overruled_by is not None:
                 self.judgements[f"overruled_by_{caption.judge.overruled_by}"] += 1
-        self._add_checks(caption.checks)
+        for language, counts in (checks.values or {}).items():
+            self.values.setdefault(language, Counter()).update(counts.model_dump())
+        self.contradicted_captions += checks.contradictions is not None
+        self.structure.update([checks.structure] if checks.structure else [])
+        self.bilingual.update([checks.bilingual] if checks.bilingual else [])
+        self.recovered.update(checks.recovered or ())
         if caption.status == "accepted":
             self.windows.kept += 1
             self.verdicts_of_accepted[str(caption.verdict)] += 1
@@ -155,17 +137,9 @@ class CaptionReport(BaseModel):
             # A refused request is a failure of the server, not a fault of the caption.
             tally = self.windows.failed if caption.drop_reason == "refused" else self.windows.dropped
             tally[str(caption.drop_reason)] += 1
-            if caption.checks.refusal is not None:
-                code, _, message = caption.checks.refusal.partition(": ")
+            if checks.refusal is not None:
+                code, _, message = checks.refusal.partition(": ")
                 self.refusals[code] = message
-
-    def _add_checks(self, checks: Checks) -> None:
-        for language, counts in (checks.values or {}).items():
-            self.values.setdefault(language, Counter()).update(counts.model_dump())
-        self.contradicted_captions += checks.contradictions is not None
-        self.structure.update([checks.structure] if checks.structure else [])
-        self.bilingual.update([checks.bilingual] if checks.bilingual else [])
-        self.recovered.update(checks.recovered or ())
 
     def finish(self, tracks: Tally, num_unanswered: int, judge_tokens: Usage | None) -> None:
         """Close the counts after the last caption, and check that no window was lost."""
@@ -223,14 +197,9 @@ def page_html(
     """
     return page(
         "caption/stage/report.html", title=name, style=STYLE, report=report, meanings=VERDICTS,
-        values=tuple(ValueCounts.model_fields), language_names=LANGUAGE_NAMES, share=_share, most_common=most_common,
+        values=tuple(ValueCounts.model_fields), language_names=LANGUAGE_NAMES, most_common=most_common,
         tokens=TOKENS, cost=_cost(report, budget), cards=[_card(caption, folders) for caption in cards],
     )  # fmt: skip
-
-
-def _share(counts: Mapping[str, int], name: str) -> str:
-    total, count = sum(counts.values()), counts.get(name, 0)
-    return f"{count:,} ({100 * count / total:.1f} %)" if total else "-"
 
 
 def _cost(report: CaptionReport, budget: BudgetConfig) -> list[tuple[str, str]]:

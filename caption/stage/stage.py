@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from caption.schema import CaptionConfig, Window
-from caption.stage.asking import ANSWERS, Asking, AskingOutcome, common_causes, read_quarantine
-from caption.stage.ledger import CaptionReport, SampleCards, explain_drops, page_html
+from caption.stage.asking import ANSWERS, Asking, AskingOutcome, read_quarantine
+from caption.stage.ledger import REPORT_FORMAT, CaptionReport, SampleCards, explain_drops, page_html
 from caption.stage.tracks import PARTS, TrackInput, find_inputs, parts_of
 from caption.stage.window_loop import caption_window
 from caption.teachers.foreign import read_given
@@ -28,7 +28,7 @@ from cosfly.llm.contract import run_until_interrupted
 from cosfly.llm.student_chat import student_files
 from cosfly.runtime.errors import ConfigError, ResumeError, TeacherError
 from cosfly.runtime.io import write_bytes
-from cosfly.runtime.json_io import write_json
+from cosfly.runtime.json_io import write_model
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally, read_manifest
 from cosfly.runtime.worker import Item, Outcome, Work, advance
@@ -122,7 +122,7 @@ def _write_report(
 
     write_caption_lines(stage.path / PRODUCT, lines())
     report.finish(outcome.tracks, len(outcome.unanswered), outcome.judge_usage)
-    write_json(stage.path / REPORT, report.as_json())
+    write_model(stage.path / REPORT, report, REPORT_FORMAT)
     folders = {track.name: track.folder for track in tracks}
     html = page_html(report, cards.chosen(), folders, cfg.budget, run_name(stage.path))
     write_bytes(stage.path / PAGE, html.encode())
@@ -141,12 +141,11 @@ def _finish(
             got=f"{outcome.stopped}; {tally.kept} windows accepted so far",
             fix="raise --max-cost or --max-tokens and run the same command again; answered windows are not asked again",
         )
-    missed = outcome.unanswered
-    if missed:
+    if outcome.unanswered:
         raise TeacherError(
-            f"{len(missed)} of {tally.input} windows got no answer",
+            f"{len(outcome.unanswered)} of {tally.input} windows got no answer",
             where=cfg.teacher,
-            got=f"{common_causes(missed)}; the last: {missed[-1].message}",
+            got=outcome.causes,
             fix="run the same command again; answered windows are not asked again",
         )
     if tally.input == 0:

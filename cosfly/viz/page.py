@@ -68,12 +68,12 @@ def _environment(is_markdown: bool = False) -> Environment:
         loader=FunctionLoader(lambda name: read_text(ROOT / name)),
     )  # fmt: skip
     environment.filters["thousands"] = "{:,}".format
+    environment.filters["share"] = lambda count, total: f"{100.0 * count / total:.1f} %" if total else "-"
     if is_markdown:
         environment.filters |= {
             "code": lambda text: Markup(markdown_code(text)),
             "codes": lambda names: Markup(", ".join(map(markdown_code, names))),
             "g": "{:g}".format,
-            "share": lambda count, total: f"{100.0 * count / total:.1f} %" if total else "-",
             "safe": Markup,
         }
     else:
