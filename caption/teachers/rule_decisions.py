@@ -14,7 +14,8 @@ from caption.verification.facts import Facts
 
 HORIZON_S = 2.5  # over which motion is extrapolated
 LEAST_TURN_DEG, LEAST_CLIMB_M, LEAST_ADVANCE_M = 3.0, 1.0, 1.0  # that call for a manoeuvre
-WEAK = 0.5  # share of an expected manoeuvre that suggests it, where flying straight on is no answer
+HINT = 0.5  # share of an expected manoeuvre that suggests it, where flying straight on is no answer
+SPEEDS = ("slow_down", "speed_up")  # which are not taken on a hint
 SHAKEN_M, SHAKEN_GAP_M = 0.4, 1.0  # a larger second difference of altitude, of distance: the track is perturbed
 
 
@@ -96,8 +97,9 @@ def ranked(f: Facts) -> list[str]:
         return [first]
     sizes = expected_sizes(f)
     others = sorted((token for token in sizes if sizes[token] >= 1.0), key=sizes.__getitem__, reverse=True)
-    weak = [token for token in sizes if WEAK <= sizes[token] < 1.0 and token not in ("slow_down", "speed_up")]
-    return list(dict.fromkeys([first, *others, "track_straight", *sorted(weak, key=sizes.__getitem__, reverse=True)]))
+    is_hinted = not is_shaken(f)  # jitter is no hint
+    hinted = [token for token in sizes if is_hinted and HINT <= sizes[token] < 1.0 and token not in SPEEDS]
+    return list(dict.fromkeys([first, *others, "track_straight", *sorted(hinted, key=sizes.__getitem__, reverse=True)]))
 
 
 def _strongest(sizes: dict[str, float]) -> str:
