@@ -32,28 +32,22 @@ plain = bench.load
 bench.load = lambda model, path, told: plain(model, path, [*told, "pedestrians.num_paths=1"])
 bench.FITTED_ON = 200
 """),
-    ("bench_camera", "--num-paths 1", r"\| own towns \| perturbed \| \d+\.\d\d, "),
-    ("bench_client", "--windows 40 --concurrency 8", r"encoded on the way .* requests/s .* ratio 0\.\d+"),
+    ("bench_client", "--windows 40 --concurrency 8", r"encoded before .* requests/s"),
     ("bench_flying", "--flights 2 --decisions 4 --workers 1", r"\d+ decisions in .* a second", HERE),
     ("bench_flying", "--envs", r"2 side by side: .* steps a second",
              "import cosfly.envs.episodes; cosfly.envs.episodes.NUM_DECISIONS = 4"),
-    ("bench_flying", "--resets", r"Reacquire-v0: reset in a known town: \d+ ms"),
-    ("bench_pages", "", r"turns at \d+ frames/s", """
+    ("bench_pages", "", r"opens in \d", """
 from cosfly.maps.synthetic import SyntheticConfig, load
 bench.TURNS, bench.census_town = 1, lambda name, seed: load(SyntheticConfig(), seed)
 """),
     ("bench_planning", "--maps a --planners track_astar muco", r"the same loss from the same start",
              SMALL_TOWN + "scenes.NUM_WALKS, bench.WALKS = 2, bench.WALKS.model_copy(update={'num_paths': 2})"),
-    ("bench_ray", "render --rounds 1", r"ray / local, by rounds: .*differences: \[\]",
+    ("bench_ray", "--rounds 1", r"ray / local, by rounds: .*differences: \[\]",
              "bench.TOWN = ('pedestrians.num_paths=2', 'render.fovs_deg=[60]', *bench.TOWN[1:])"),
-    ("bench_ray", "memory --counts 10", r"ray, 10 items: driver .* items/s"),
-    ("bench_release", "speed 8 --rounds 1", r"depth, one core: \d+ MB/s",
-             "bench.NUM_POINTS, bench.NUM_POOL, bench.FRAMES_RELEASED, bench.SIZES['speed'] = 8, 1, 4, (160, 90)"),
-    ("bench_release", "memory 800", r"800 frames: main"),
-    ("bench_render", "parts --frames 2", r"CPU ms a frame", SMALL_TOWN),
-    ("bench_render", "memory --frames 20", r"Memory", SMALL_TOWN),
+    ("bench_release", "8 --rounds 1", r"build: \d+ % of the speed of the copy",
+             "bench.NUM_POINTS, bench.NUM_POOL, bench.FRAMES_RELEASED, bench.SIZE_PX = 8, 1, 4, (160, 90)"),
+    ("bench_render", "--frames 2", r"CPU ms a frame", SMALL_TOWN),
     ("bench_training", "--batch 1 --steps 1", r'"tokens_per_s": \d'),
-    ("bench_training", "--check", r'"relative_difference_of_gradients": \d'),
     ("seeing_student", "--language none.gguf --epochs 1 --workers 1 --without none --out OUT RUN/render",
              r'"target_found": {"trained": [01]\.\d+', """
 bench.VISION.update(hidden_size=32, intermediate_size=32, num_hidden_layers=1, num_attention_heads=2)

@@ -1,14 +1,11 @@
-"""How much of a bare load loop's throughput the caption client reaches: `python tests/benchmarks/bench_client.py`.
+"""How many requests a second the caption client sends: `python tests/benchmarks/bench_client.py`.
 
 A local server in its own process answers every request after a fixed 200 ms. The client captions windows of 15 pictures
-of 640x360; the requests it sent are then sent again by bare httpx loops with the same concurrency, from bytes made
-beforehand: one loop with one client and its pool of connections, one with a client to each worker. Reported: requests
-per second of all and the ratio to the faster loop, once with pictures encoded beforehand and once encoded on the way.
+of 640x360, once with pictures encoded beforehand and once encoded on the way.
 """
 
 import argparse
 import asyncio
-import contextlib
 import json
 import multiprocessing
 import shutil
@@ -19,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import httpx
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -55,22 +51,13 @@ def main() -> None:
         tree = _make_tree(folder / "tree", args.windows)
         cfg = _settings(url, args.concurrency)
         # First run: pictures on the way, cold. Second: another folder, the same pictures already encoded.
-        cold_s, bodies, encoded = _client(cfg, tree, folder / "cold", None)
-        warm_s, _, _ = _client(cfg, tree, folder / "warm", encoded)
-        pool_s = asyncio.run(_bare(url, bodies, args.concurrency, 1))
-        own_s = asyncio.run(_bare(url, bodies, args.concurrency, args.concurrency))
+        encoded: dict[tuple, list] = {}
+        rates = [_client(cfg, tree, folder / name, encoded) for name in ("cold", "warm")]
     finally:
         server.terminate()
         shutil.rmtree(folder)
-    count = len(bodies)
-    size = sum(map(len, bodies)) / count / 1e6
-    print(f"{count} requests of {size:.2f} MB on average, {args.concurrency} in flight, answers after {DELAY_S} s")
-    best_s = min(pool_s, own_s)
-    for name, seconds in (
-        ("bare httpx loop, one pool", pool_s), ("bare httpx loop, a client to each worker", own_s),
-        ("caption client, pictures encoded before", warm_s), ("caption client, encoded on the way", cold_s),
-    ):  # fmt: skip
-        print(f"{name:<42} {count / seconds:7.1f} requests/s   {seconds:6.2f} s   ratio {best_s / seconds:.3f}")
+    for name, rate in zip(("encoded on the way", "encoded before"), rates, strict=True):
+        print(f"pictures {name:<20} {rate:7.1f} requests/s")
 
 
 def _settings(url: str, concurrency: int) -> CaptionConfig:
@@ -79,18 +66,14 @@ def _settings(url: str, concurrency: int) -> CaptionConfig:
     return CaptionConfig.model_validate({"teacher": url, "endpoint": endpoint, "repair": repair})
 
 
-def _client(
-    cfg: CaptionConfig, tree: Path, out: Path, known: dict | None
-) -> tuple[float, list[bytes], dict[tuple, list]]:
-    """Caption the tree; gives seconds, the bodies sent (of the cold run alone: to keep them takes time), and the
-    pictures of each frame.
+def _client(cfg: CaptionConfig, tree: Path, out: Path, encoded: dict[tuple, list]) -> float:
+    """Caption the tree and return requests per second; pictures of a frame that are in `encoded` are not made again.
 
     The product is not merged: only asking counts.
     """
     stage = open_stage(cfg, tree, out, 0, "never")
     tracks, _ = find_inputs(cfg, tree)
-    bodies: list[bytes] = []
-    encoded: dict[tuple, list] = {} if known is None else known
+    sent: list[None] = []
     plain_encode, plain_body = teacher.encode_frame, protocol.request_body
 
     def encoding(*args: Any) -> list:
@@ -98,12 +81,11 @@ def _client(
             encoded[args[:2]] = plain_encode(*args)
         return encoded[args[:2]]
 
-    def recording(*args: Any, **options: bool) -> bytes:
-        bodies.append(plain_body(*args, **options))
-        return bodies[-1]
+    def counting(*args: Any, **options: bool) -> bytes:
+        sent.append(None)
+        return plain_body(*args, **options)
 
-    teacher.encode_frame = encoding
-    protocol.request_body = recording if known is None else plain_body
+    teacher.encode_frame, protocol.request_body = encoding, counting
     try:
         start_s = time.monotonic()
         asked = asyncio.run(Asking(stage, cfg, VOCABULARY, 0).run(tracks))
@@ -111,27 +93,7 @@ def _client(
     finally:
         teacher.encode_frame, protocol.request_body = plain_encode, plain_body
     assert not asked.unanswered, asked.unanswered[:3]
-    return seconds, bodies, encoded
-
-
-async def _bare(url: str, bodies: list[bytes], concurrency: int, num_clients: int) -> float:
-    left, headers = iter(bodies), {"Content-Type": "application/json"}
-    limits = httpx.Limits(max_connections=concurrency, max_keepalive_connections=concurrency)
-    async with contextlib.AsyncExitStack() as stack:
-        tls = httpx.create_ssl_context()
-        clients = [
-            await stack.enter_async_context(httpx.AsyncClient(limits=limits, timeout=120.0, verify=tls))
-            for _ in range(num_clients)
-        ]
-
-        async def worker(client: httpx.AsyncClient) -> None:
-            for body in left:
-                response = await client.post(f"{url}/chat/completions", content=body, headers=headers)
-                assert response.status_code == 200
-
-        start_s = time.monotonic()
-        await asyncio.gather(*(worker(clients[k % num_clients]) for k in range(concurrency)))
-        return time.monotonic() - start_s
+    return len(sent) / seconds
 
 
 def _make_tree(root: Path, num_windows: int) -> Path:

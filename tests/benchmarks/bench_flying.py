@@ -1,13 +1,12 @@
 """How many decisions a second the closed loop takes: 64 flights of 200 decisions with the rule teacher; and how many
-steps a second an environment: alone, and two side by side in processes; and the processor time of its `reset`.
+steps a second an environment: alone, and two side by side in processes.
 
     python tests/benchmarks/bench_flying.py                     a town of our own, two workers, 640x360
     python tests/benchmarks/bench_flying.py --flights 8 --decisions 50 --rounds 3
     python tests/benchmarks/bench_flying.py --envs --rounds 3   cosfly/Follow-v0, 640x360; --size 64 48 for another
-    python tests/benchmarks/bench_flying.py --resets            all environments, 640x360
 
 Planning is done first and not counted; starting workers, maps, drawing and deciding are. Of an environment its steps
-alone are counted, from the second on. A reset is counted in the towns of all environments, the first time and again.
+alone are counted, from the second on.
 """
 
 import argparse
@@ -15,8 +14,6 @@ import os
 import tempfile
 import time
 from pathlib import Path
-
-import numpy as np
 
 from caption.schema import CaptionConfig
 from cosfly.closed_loop import stage
@@ -33,30 +30,6 @@ from cosfly.simplify.passes import SimplifyConfig, simplify
 from distill.inference.stage import InferConfig
 
 SEED = 64
-
-
-def time_resets(rounds: int) -> None:
-    import gymnasium
-
-    from cosfly.envs.episodes import TASKS
-
-    for task in TASKS:
-        env = gymnasium.make(task)
-        env.reset(seed=SEED)  # compiles
-        first, again = list[float](), list[float]()
-        known = set[str]()
-        for seed in range(20 * rounds):
-            begun_s = time.process_time()
-            _, told = env.reset(seed=seed)
-            seconds = time.process_time() - begun_s
-            town = told["episode_id"].partition("_path")[0]
-            (again if town in known else first).append(seconds)
-            known.add(town)
-        for what, times in (("a new town", first), ("a known town", again)):
-            ms = 1000.0 * np.array(times)
-            print(f"{task}: reset in {what}: {np.median(ms):.0f} ms of processor time, mean {ms.mean():.0f}, "
-                  f"most {ms.max():.0f}, {len(ms)} resets")  # fmt: skip
-        env.close()
 
 
 def time_envs(rounds: int, size_px: tuple[int, int]) -> None:
@@ -96,13 +69,9 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--envs", action="store_true", help="steps of environments in place of flights")
     parser.add_argument("--size", type=int, nargs=2, default=(640, 360), help="width and height of pictures of --envs")
-    parser.add_argument("--resets", action="store_true", help="resets of environments in place of flights")
     asked = parser.parse_args()
     if asked.envs:
         time_envs(asked.rounds, tuple(asked.size))
-        return
-    if asked.resets:
-        time_resets(asked.rounds)
         return
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)

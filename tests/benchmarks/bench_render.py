@@ -1,14 +1,12 @@
-"""Rendering: where a frame's processor time goes, a map of 62,640 boxes, memory over thousands of frames.
+"""Rendering: where a frame's processor time goes.
 
-    python tests/benchmarks/bench_render.py parts                          # one process, no workers
-    python tests/benchmarks/bench_render.py memory --frames 5000
+    python tests/benchmarks/bench_render.py --frames 24                    # one process, no workers
 
 1280x720, all files, the synthetic town and the SimWorld city, flights of the default planner. On a
 machine with a GPU the same commands use it (the device is printed); `cosfly bench` measures the stage as it is used.
 """
 
 import argparse
-import resource
 import tempfile
 from collections import Counter
 from dataclasses import replace
@@ -28,10 +26,8 @@ from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_trajectory
 from cosfly.render import track as flight
 from cosfly.render.person import choose_clothes, gait_of
-from cosfly.render.perturbation import Surroundings
-from cosfly.render.settings import RenderConfig
-from cosfly.render.stage import make_track_script, open_renderer
-from cosfly.render.track import MARGIN_M, render_track
+from cosfly.render.stage import open_renderer
+from cosfly.render.track import MARGIN_M
 
 SIZE = (1280, 720)
 FOVS_DEG = (60.0, 90.0)
@@ -115,42 +111,15 @@ def parts(folder: Path, num_frames: int) -> tuple[str, list[Any]]:
     return device, [used[name] / num_frames for name in names]
 
 
-def resident_mib() -> float:
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize() / 2**20
-
-
-def memory(num_frames: int) -> list[list[Any]]:
-    """Resident memory of a process that draws and writes one flight after the other, small frames."""
-    box_map = scenes.town()
-    simple, cfg = scenes.simplified(box_map), PlanConfig()
-    (walk,) = scenes.walks_on(simple, num_paths=1)
-    trace = plan_trajectory(walk, obstacle_index(simple), cfg, scenes.SEED)
-    small = RenderConfig(width_px=160, height_px=90, fovs_deg=(90.0,), first_timestamp=1776000000)
-    renderer = open_renderer("gl", box_map, small.width_px, small.height_px)
-    rows, done = [], 0
-    while done < num_frames:
-        script = make_track_script(trace, 0, "clean", "Town", Surroundings(simple), small, 0)
-        with tempfile.TemporaryDirectory() as scratch:
-            done += len(render_track(renderer, script, Path(scratch), small))
-        if not rows or done - rows[-1][0] >= num_frames // 10:
-            rows.append([done, resident_mib()])
-    return [[count, mib, 100.0 * (mib / rows[min(1, len(rows) - 1)][1] - 1.0)] for count, mib in rows]
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("parts", "memory"))
-    parser.add_argument("--frames", type=int, help="frames of a measurement")
+    parser.add_argument("--frames", type=int, default=40, help="frames of a measurement")
     given = parser.parse_args()
     scenes.one_thread_and_machine()
     cv2.setNumThreads(1)
-    if given.what == "memory":
-        scenes.print_table("Memory", ["frames", "MiB", "% over the second row"], memory(given.frames or 5000))
-        return
     with tempfile.TemporaryDirectory() as root:
         folders = make_inputs(Path(root))
-        found = {name: parts(folder, given.frames or 40) for name, folder in folders.items()}
+        found = {name: parts(folder, given.frames) for name, folder in folders.items()}
     names = ["map", "draw", "read", "PNG rgb", "PNG ids", "npy", "hash", "write", "sum"]
     rows = [[name, *used, sum(used)] for name, (_, used) in found.items()]
     scenes.print_table(f"CPU ms a frame, {next(iter(found.values()))[0]}", names, rows)

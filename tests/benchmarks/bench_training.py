@@ -5,8 +5,6 @@ samples.
     python $P --shape 2b --batch 16              on an accelerator
     python $P --batch 2 --steps 3                on a CPU: a tiny shape, to see that it runs
     torchrun --nproc-per-node 4 $P --shape 2b --batch 64 --micro 16
-    python $P --shape 2b --check                 loss and gradients against plain, in float32; `--kept FILE` keeps them
-    python $P --shape 2b --check --dtype bfloat16 --kept FILE    bfloat16 and the fast kernels against what was kept
     python $P --shape smollm2 --batch 64 --micro 32              SmolLM2-135M, text alone; `--plain` is the same with
                                                                  plain transformers and peft
 
@@ -23,7 +21,6 @@ import numpy as np
 import torch
 from accelerate import Accelerator
 from peft import LoraConfig, get_peft_model
-from safetensors.torch import load_file, save_file
 
 from cosfly.viz.frame_views import Pictures
 from distill.student.chat import EncodedSample, padded
@@ -163,7 +160,7 @@ def backward(student: Student, way: str, rows: list, features: dict[FramePicture
 
 
 def measure(arguments: argparse.Namespace, accelerator: Accelerator, device: str) -> dict[str, Any]:
-    shape, dtype = arguments.shape, compute_dtype(arguments.dtype, device)
+    shape, dtype = arguments.shape, compute_dtype("auto", device)
     cfg = TrainConfig(batch_size=arguments.micro or arguments.batch, samples_per_step=arguments.batch)
     student, way = make_student(shape, device, dtype), "plain" if arguments.plain else "ours"
     if arguments.plain:
@@ -171,7 +168,7 @@ def measure(arguments: argparse.Namespace, accelerator: Accelerator, device: str
         student.model = get_peft_model(student.model, lora)
     else:
         student = add_adapter(student, cfg, 0)
-        if shape in TOWERS and not arguments.library_norms:
+        if shape in TOWERS:
             fuse_norms(student.core)
     for layer in student.core.get_decoder().layers if arguments.compile else ():
         layer.compile(dynamic=True)
@@ -207,68 +204,19 @@ def measure(arguments: argparse.Namespace, accelerator: Accelerator, device: str
     }  # fmt: skip
 
 
-def check(arguments: argparse.Namespace, device: str) -> dict[str, Any]:
-    """Hold our loss and gradients against plain transformers on the same weights and samples.
-
-    Both in float32, of one process; in bfloat16 against what a float32 run left in `--kept`, since a process has either
-    PyTorch's functions or the fast kernels.
-    """
-    cfg, dtype = TrainConfig(), compute_dtype(arguments.dtype, device)
-    if arguments.dtype == "auto":
-        dtype = torch.float32
-    student = add_adapter(make_student(arguments.shape, device, dtype), cfg, 0)
-    learned = {name: parameter for name, parameter in student.model.named_parameters() if parameter.requires_grad}
-    rows = make_rows(arguments.shape, 2, 0)
-
-    def gradients_of(way: str) -> dict[str, torch.Tensor]:
-        loss = backward(student, way, rows, {})
-        gradients = {name: parameter.grad.float().cpu() for name, parameter in learned.items()}
-        student.model.zero_grad(set_to_none=True)
-        return {"loss": torch.tensor(loss)} | gradients
-
-    def both(kept: dict[str, torch.Tensor], ours: dict[str, torch.Tensor]) -> dict[str, float]:
-        a, b = (torch.cat([tensors[name].reshape(-1) for name in learned]) for tensors in (kept, ours))
-        return {
-            "loss_plain": float(kept["loss"]), "loss_ours": float(ours["loss"]),
-            "relative_difference_of_gradients": float((a - b).norm() / a.norm()),
-        }  # fmt: skip
-
-    if dtype != torch.float32:
-        kept = load_file(arguments.kept)
-        with torch.no_grad():
-            for name, parameter in learned.items():
-                parameter.copy_(kept[f"value {name}"])
-        fuse_norms(student.core)
-        return both(kept, gradients_of("ours"))
-    with torch.no_grad():
-        for name, parameter in learned.items():
-            if "lora_B" in name:
-                parameter.normal_(0, 0.02)
-    found = gradients_of("plain")
-    if arguments.kept:
-        values = {f"value {name}": parameter.detach().cpu().contiguous() for name, parameter in learned.items()}
-        save_file(found | values, arguments.kept)
-    fuse_norms(student.core)
-    return both(found, gradients_of("ours"))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shape", choices=SHAPES, default="tiny")
     parser.add_argument("--batch", type=int, default=4, help="samples of a step, over all processes")
     parser.add_argument("--micro", type=int, default=0, help="samples of a forward pass; 0: all of the step")
     parser.add_argument("--steps", type=int, default=10)
-    parser.add_argument("--dtype", choices=("auto", "float32", "bfloat16"), default="auto")
     parser.add_argument("--same", action="store_true", help="the same samples in every step: all features are kept")
     parser.add_argument("--plain", action="store_true", help="plain transformers and peft, for comparison")
     parser.add_argument("--compile", action="store_true", help="compile the layers of the language model")
-    parser.add_argument("--library-norms", action="store_true", help="the norms of transformers, for comparison")
-    parser.add_argument("--check", action="store_true")
-    parser.add_argument("--kept", help="a safetensors file of a float32 check's gradients and adapter")
     arguments = parser.parse_args()
     device = pick_device("auto")
     accelerator = Accelerator(cpu=device == "cpu")
-    found = check(arguments, device) if arguments.check else measure(arguments, accelerator, device)
+    found = measure(arguments, accelerator, device)
     if accelerator.is_main_process:
         print(json.dumps(found))
     accelerator.end_training()

@@ -3,7 +3,6 @@ repository."""
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from cosfly.simplify.passes import SimplifyConfig, simplify
 
 SHARED_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 NUM_WALKS, SEED = 20, 0
-CITY_GAP_M = 20.0  # between the tiles of map (c)
+CITY_GAP_M = 20.0  # between the tiles of a larger map
 
 
 def town(seed: int = SEED) -> BoxMap:
@@ -67,16 +66,6 @@ def walks_on(box_map: BoxMap, **settings: Any) -> list[PedestrianTrajectory]:
     ground = walkable_ground(box_map, cfg)
     names = [f"path_{k:05d}" for k in range(cfg.num_paths)]
     return [make_pedestrian(name, ground, cfg, rng_for(SEED, "pedestrians", name)).trajectory for name in names]
-
-
-def moved(walk: PedestrianTrajectory, shift_m: np.ndarray) -> PedestrianTrajectory:
-    return replace(walk, polyline_m=walk.polyline_m + shift_m[:2], positions_m=walk.positions_m + shift_m)
-
-
-def first_points(walk: PedestrianTrajectory, count: int) -> PedestrianTrajectory:
-    return replace(
-        walk, time_s=walk.time_s[:count], positions_m=walk.positions_m[:count], speeds_mps=walk.speeds_mps[:count]
-    )
 
 
 def cpu_ms(function: Callable[[], Any]) -> tuple[float, Any]:
