@@ -4,8 +4,11 @@ Images are painted by a plain NumPy ray caster (a ground plane, some boxes, the 
 boxes and visibilities agree with the poses in `trajectory.json`.
 """
 
+import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -232,6 +235,14 @@ def paint(scene: Scene, flight: Track, i: int) -> tuple[np.ndarray, np.ndarray, 
     depth = np.where(is_sky, SKY_DEPTH_M, depth).astype(np.float32)
     rgb, ids = rgb.reshape(h, w, 3).astype(np.uint8), instance.reshape(h, w).astype(np.uint16)
     return rgb, depth.reshape(h, w), semantic.reshape(h, w).astype(np.uint8), ids
+
+
+def change_json(path: Path, change: Callable[[Any], object]) -> None:
+    """Change a JSON file by a function that changes its value."""
+    value = json.loads(path.read_text())
+    change(value)
+    path.unlink()  # it may be a link
+    path.write_text(json.dumps(value))
 
 
 def pack_depth(folder: Path) -> None:

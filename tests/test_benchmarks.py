@@ -53,7 +53,7 @@ bench.TURNS, bench.census_town = 1, lambda name, seed: load(SyntheticConfig(), s
 bench.VISION.update(hidden_size=32, intermediate_size=32, num_hidden_layers=1, num_attention_heads=2)
 bench.assemble = lambda language, out, tower: None  # needs the weights of SmolLM2
 """),
-    ("dagger_rounds", f"--train RUN --test RUN --out OUT {DRAWN_SMALL}", r"control1 success",
+    ("dagger_rounds", f"--train RUN --test RUN --out OUT {DRAWN_SMALL}", r"r1 success",
              HERE + """
 def cosfly(*words):
     done = invoke([*words])

@@ -48,28 +48,6 @@ def test_what_becomes_of_a_soft_conflict(treatment):
 
 
 @each("strategy", ["anchored", "cascade"])
-def test_a_record_says_that_a_caption_is_anchored_and_by_which_strategy(strategy):
-    track = dataclasses.replace(make_flight(60)[0], folder=Path("nowhere"))
-    cfg = CFG.model_copy(update={"repair": RepairConfig(soft_conflict="repair", strategy=strategy)})
-    captions = [
-        asyncio.run(caption_window(window, RuleTeacher(0), cfg, VOCABULARY))
-        for window in cut_windows(track, cfg.window)
-    ]
-    rejected = [caption for caption in captions if caption.repair is not None]
-    assert any(caption.status == "accepted" for caption in rejected)
-    # The rule teacher gives the same answer to a hint and to another seed.
-    asks = 3 if strategy == "cascade" else 1
-    for caption in rejected:
-        repair = caption.repair
-        assert repair is not None
-        assert (repair.strategy, repair.asks) == (strategy, asks)
-        if caption.status == "accepted":
-            assert (repair.rung, repair.outcome) == ("anchored", "repaired")
-        else:
-            assert (repair.rung, repair.outcome, caption.drop_reason) == (None, "failed", "no_reason")
-
-
-@each("strategy", ["anchored", "cascade"])
 def test_a_conflict_without_a_reason_for_its_label_counts_as_not_repaired(strategy):
     cfg = CFG.model_copy(update={"repair": RepairConfig(hard_conflict="repair", soft_conflict="repair")})
     track = dataclasses.replace(make_flight(60)[0], folder=Path("nowhere"))

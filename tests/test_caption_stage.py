@@ -16,7 +16,7 @@ from cosfly.formats.captions import read_captions
 from cosfly.formats.playback import read_track, write_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import NothingKept, ResumeError
-from specimens import make_playback_tree
+from specimens import change_json, make_playback_tree
 
 
 @pytest.fixture(scope="module")
@@ -118,14 +118,10 @@ def test_bad_flights_are_counted_and_the_others_captioned(tree, tmp_path):
     root = tmp_path / "tree"
     shutil.copytree(tree, root)
     folders = find_tracks(root)
-    raw = json.loads((folders[0] / "trajectory.json").read_text())
-    raw["points"] = raw["points"][:9]  # one short of a window and its future
-    (folders[0] / "trajectory.json").write_text(json.dumps(raw))
-    (folders[1] / "trajectory.json").write_text('{"schema":')
-    text = (folders[2] / "trajectory.json").read_text()
-    raw = json.loads(text)
-    raw["points"][3]["drone_pose"]["x"] = None
-    (folders[2] / "trajectory.json").write_text(json.dumps(raw))
+    flights = [folder / "trajectory.json" for folder in folders]
+    change_json(flights[0], lambda raw: raw.update(points=raw["points"][:9]))  # one short of a window and its future
+    flights[1].write_text('{"schema":')
+    change_json(flights[2], lambda raw: raw["points"][3]["drone_pose"].update(x=None))
     (folders[5] / "frames_playback" / "frame_00006" / "rgb.png").unlink()
     out = run(CaptionConfig(), root, tmp_path / "out").parent
     report = json.loads((out / "caption_report.json").read_text())

@@ -183,16 +183,6 @@ def test_all_slots_of_a_large_server_are_soon_in_use(num_slots):
     assert full_s <= math.log2(num_slots)
 
 
-def test_a_timeout_of_the_first_requests_does_not_slow_the_rise():
-    limit = ConcurrencyLimit(64)
-    for _ in range(3):  # the server is starting
-        limit.was_busy(sent_s=float("inf"), retry_after_s=None)
-    assert limit.limit == 1
-    for _ in range(63):
-        limit.succeeded(is_quick=True)
-    assert limit.limit == 64
-
-
 def test_a_retry_after_holds_every_request():
     async def start_s() -> float:
         limit = ConcurrencyLimit(2)

@@ -3,12 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
-from benchmarks.bench_blind import is_drawn_ahead
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.formats.segments import Segment
 from cosfly.geometry.axes import rotation_matrices
 from cosfly.inspection.blind_baseline import past_of
 from specimens import make_flight
@@ -66,26 +63,3 @@ def test_a_past_holds_what_a_prompt_may_tell():
     hidden = replace(clean, target=replace(clean.target, visible=np.zeros(NUM, dtype=bool)))
     moved = replace(hidden, targets_m=hidden.targets_m + np.random.default_rng(0).normal(size=(NUM, 3)))
     assert np.array_equal(past_of(moved, range(5), False), past_of(hidden, range(5), False))
-
-
-@pytest.mark.parametrize(("steps_m", "first", "last"), [
-    ([0.6] * 8 + [0.0] * 4, 3, 7),  # it stops on the way to frame 8
-    ([0.0] * 8 + [0.6] * 4, 3, 7),  # it sets off
-])  # fmt: skip
-def test_who_stops_or_sets_off_within_the_labels_future_was_drawn_ahead(steps_m, first, last):
-    flight = flight_of(straight(steps_m))
-    found = [now for now in range(1, NUM - 5) if is_drawn_ahead(flight, now, now + 5, False)]
-    assert found == [now for now in range(first, last + 1) if now < NUM - 5]
-
-
-def test_turns_and_other_parts_are_drawn_ahead_and_bends_and_orders_are_not():
-    right_angle = np.vstack([EVEN[:8], EVEN[7] + np.column_stack([np.zeros(4), 0.6 * np.arange(1, 5)])])
-    bend = np.column_stack([np.linspace(0, 6, NUM), np.linspace(0, 1, NUM) ** 2])
-    assert not any(is_drawn_ahead(flight_of(way), now, now + 5, False) for way in (EVEN, bend) for now in range(1, 6))
-    assert [now for now in range(1, 7) if is_drawn_ahead(flight_of(right_angle), now, now + 5, False)] == [3, 4, 5, 6]
-    parts = flight_of(EVEN, segments=(Segment("side", 0, 7), Segment("top", 7, NUM)))
-    assert [now for now in range(1, NUM - 5) if is_drawn_ahead(parts, now, now + 5, False)] == [2, 3, 4, 5, 6]
-    assert is_drawn_ahead(parts, 4, 9, True) is False
-    nobody = replace(parts, targets_m=np.full((NUM, 3), np.nan))
-    assert is_drawn_ahead(nobody, 4, 9, False) is None
-    assert is_drawn_ahead(parts, 0, 5, False) is None

@@ -150,17 +150,6 @@ for _ in range(81):
     seen, _, _, _, info = envs.step(np.array([14, 14]))
 assert "episode" in info or seen.shape[0] == 2
 """,
-    "AsyncVectorEnv": """
-import gymnasium, numpy as np
-make = lambda: gymnasium.make("cosfly.envs:cosfly/Follow-v0", observation="numbers", size_px=(64, 48))
-envs = gymnasium.vector.AsyncVectorEnv([make] * 2)
-first, _ = envs.reset(seed=[1, 2])
-seen, rewards, *_ = envs.step(np.array([14, 14]))
-alone = make()
-alone.reset(seed=2)
-assert (alone.step(14)[0]["goal"] == seen["goal"][1]).all() and seen["goal"].any()
-envs.close()
-""",
     "stable_baselines3": """
 import gymnasium, cosfly.envs
 from stable_baselines3 import PPO

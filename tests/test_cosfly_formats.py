@@ -22,6 +22,7 @@ from cosfly.geometry.goals import SIDES, SLOTS, SeenFrame, find_says, meant, wor
 from cosfly.render.person import draw_appearance, look_alike
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import validated
+from specimens import change_json
 
 
 def some_boxes(n=3, seed=0):
@@ -85,22 +86,15 @@ def test_path_and_trace_round_trip(tmp_path, subtests):
                     assert_allclose(getattr(back, name), value)
                 else:
                     assert getattr(back, name) == value
-            value = json.loads(path.read_text())
-            value[group][0]["t"][1] = "x"
-            path.write_text(json.dumps(value))
-            with pytest.raises(InputError, match=rf"{group}\[0\]\.t"):
-                read(path)
-            value[group][0]["t"][1] = value[group][0]["t"][0]
-            path.write_text(json.dumps(value))
-            with pytest.raises(InputError, match=rf"{group}\[0\]\.t: the times do not increase; got 0, then 0"):
-                read(path)
-            write(path, [make()], {})
-            value = json.loads(path.read_text())
-            record = value[group][0]
-            record.get("target", record)["y"][1] = 1e9
-            path.write_text(json.dumps(value))
-            with pytest.raises(InputError, match=rf"{group}\[0\].*y: a place is too far from the origin; got 1e\+09"):
-                read(path)
+            for change, words in (
+                (lambda record: record["t"].__setitem__(1, "x"), r"t"),
+                (lambda record: record["t"].__setitem__(1, record["t"][0]), r"t: the times do not increase; got 0, th"),
+                (lambda record: record.get("target", record)["y"].__setitem__(1, 1e9), r".*y: a place is too far from"),
+            ):
+                write(path, [make()], {})
+                change_json(path, lambda value, change=change, group=group: change(value[group][0]))
+                with pytest.raises(InputError, match=rf"{group}\[0\].*{words}"):
+                    read(path)
 
 
 def test_a_drawn_person_is_read_back_as_written():

@@ -1,7 +1,6 @@
 """Inspection: clean flights pass, every planted defect is found and named, and the funnel adds up."""
 
 import contextlib
-import json
 import re
 import shutil
 from dataclasses import replace
@@ -30,7 +29,7 @@ from cosfly.inspection.track import check_plan, is_shifted
 from cosfly.runtime.errors import NothingKept
 from cosfly.runtime.io import CHECKSUMS, sha256_file, write_checksums
 from cosfly.runtime.json_io import read_json, write_json
-from specimens import make_playback_tree
+from specimens import change_json, make_playback_tree
 
 NUM_POINTS = 10
 
@@ -257,12 +256,6 @@ def test_a_shift_that_hides_what_the_clean_flight_shows_goes_to_review(workplace
     assert "hidden_by_shift" not in codes_of(inspect(workplace, cfg, "again"), folder)
 
 
-def edit(folder: Path, change, name: str = "trajectory.json") -> None:
-    value = read_json(folder / name)
-    change(value)
-    (folder / name).write_text(json.dumps(value))
-
-
 def edit_image(path: Path, change) -> None:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     cv2.imwrite(str(path), change(image))
@@ -282,6 +275,10 @@ def without_person(image: np.ndarray) -> np.ndarray:
     image = image.copy()
     image[image[..., 2] == 12] = 0
     return image
+
+
+def edit(folder: Path, change) -> None:
+    change_json(folder / "trajectory.json", change)
 
 
 def at_point(key, name, value, index=3):
@@ -343,7 +340,7 @@ DEFECTS = {
     "illegible": lambda f: edit(f, lambda t: [p["target"].update(legible=False) for p in t["points"]]),
     "teleport": lambda f: edit(f, lambda t: t["points"][3]["drone_pose"].update(x=99.0)),
     "missing_file that is listed": lambda f: (f / FRAME / "meta.json").unlink(),
-    "broken_annotation of another frame": lambda f: edit(f / FRAME, lambda m: m.update(index=4), "meta.json"),
+    "broken_annotation of another frame": lambda f: change_json(f / FRAME / "meta.json", lambda m: m.update(index=4)),
     "wrong_format of instances": lambda f: edit_image(f / FRAME / "instance.png", lambda image: image[:54, :96]),
     "broken_image in grey": lambda f: cv2.imwrite(
         str(f / FRAME / "rgb.png"), np.arange(192 * 108, dtype=np.uint8).reshape(108, 192)

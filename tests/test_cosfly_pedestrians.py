@@ -29,6 +29,7 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import simplify
+from specimens import change_json
 
 BUILDINGS, ROADS = KINDS["Buildings"], KINDS["Roads"]
 
@@ -265,10 +266,8 @@ def test_others_round_trip_and_bad_files(tmp_path):
         (tmp_path / "bad.json").write_text(text.replace(old, new, 1))
         with pytest.raises(InputError, match=words):
             read_bystanders(tmp_path / "bad.json")
-    value = json.loads(path.read_text())
-    for axis in ("x", "y", "z", "yaw"):
-        value["paths"][0]["others"][1][axis].append(1.0)
-    path.write_text(json.dumps(value))
+    axes = ("x", "y", "z", "yaw")
+    change_json(path, lambda value: [value["paths"][0]["others"][1][axis].append(1.0) for axis in axes])
     with pytest.raises(InputError, match=r"paths\[0\]\.others.*|different lengths"):
         read_bystanders(path)
 

@@ -4,8 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from specimens_planning import CANYON, town_of, walk_along
 from test_cosfly_render import needs_gl
 from test_cosfly_zoom import IN_THE_WALL
@@ -19,7 +17,7 @@ from cosfly.planners.contract import PlanConfig
 from cosfly.runtime.run_dir import read_manifest
 from cosfly.studies import beam
 from cosfly.studies.beam import FIGURES, PAPER_BEAM, Planned
-from cosfly.studies.depth import BITS, quantised, study_of
+from cosfly.studies.depth import study_of
 from cosfly.studies.zoom import enlarged_fov_deg, tree_of
 
 NEAR_M, FAR_M = 15.36, 38.32  # tab:depth_format_comparison
@@ -45,16 +43,6 @@ def test_depths_spread_evenly_give_the_papers_errors():
         assert row["psnr_db"] == pytest.approx(psnr_db, abs=0.3)
         kib = 360 * 640 * int(coding.removesuffix("-bit")) / 8 / 1024
         assert row["kilobytes"] == pytest.approx(kib), "as the paper's column counts them"
-
-
-@given(st.sampled_from(BITS), st.integers(0, 2**31))
-def test_codes_are_within_half_a_step(bits, seed):
-    truth = np.random.default_rng(seed).uniform(1, 90, (5, 7)).astype(np.float32)
-    measured = np.ones_like(truth, dtype=bool)
-    codes, values = quantised(truth, measured, bits)
-    step = (float(truth.max()) - float(truth.min())) / (2**bits - 1)
-    assert np.abs(values - truth).max() <= step / 2 * 1.0001 + 1e-6
-    assert (codes.min(), codes.max()) == (0, 2**bits - 1)
 
 
 def planned(value, reason=None):

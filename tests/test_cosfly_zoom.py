@@ -19,7 +19,7 @@ from cosfly.render.stage import run
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import ConfigError, InputError
 from release.columns import INTRINSICS, Placement, matrices_of, scalar_row
-from specimens import make_flight
+from specimens import change_json, make_flight
 
 LEVELS = (110.0, 90.0, 60.0, 30.0)
 SMALL = {"width_px": 160, "height_px": 90, "town": "Street", "first_timestamp": 1776000000}
@@ -72,9 +72,7 @@ def test_the_cameras_of_a_flight_survive_the_file(tmp_path):
         matrices_of(np.array([row["intrinsics"][name] for name in INTRINSICS])[None])[0], flight.intrinsics[7]
     )
     assert row["fov_deg"] == pytest.approx(found.camera_at(7).fov_deg, abs=1e-6)
-    raw = json.loads((folder / "trajectory.json").read_text())
-    raw["points"][3]["camera"]["intrinsic"] = [[0, 0, 0]] * 3
-    (folder / "trajectory.json").write_text(json.dumps(raw))
+    change_json(folder / "trajectory.json", lambda raw: raw["points"][3]["camera"].update(intrinsic=[[0, 0, 0]] * 3))
     with pytest.raises(InputError, match=r"points\[3\]\.camera\.intrinsic"):
         read_track(folder)
     assert any("points[3].camera" in issue for issue in read_track(folder, strict=False).issues)

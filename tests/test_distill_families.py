@@ -22,10 +22,16 @@ from distill.inference import stage as infer
 from distill.student.chat import padded
 from distill.student.model import load_student
 from distill.training.loss import answer_loss
+from specimens import change_json
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SIZES_PX = ((64, 36), (320, 180), (224, 126), (160, 90))
+
+
+@pytest.fixture
+def llama(built_once) -> Path:
+    return built_once("family_llama", lambda root: make_family("llama", root / "llama")) / "llama"
 
 
 @pytest.fixture(params=FAMILIES)
@@ -110,9 +116,8 @@ def test_a_family_trains_resumes_merges_and_answers(place, family, tmp_path):
     assert bool(taught["looks"][0]["views"]) == (family.name not in TEXT_ONLY)
 
 
-def test_the_decision_can_weigh_more_and_come_first(place, built_once):
-    folder = built_once("family_llama", lambda root: make_family("llama", root / "llama")) / "llama"
-    own, sample = load_student(folder, device="cpu"), samples_of(place)[0].without_pictures()
+def test_the_decision_can_weigh_more_and_come_first(place, llama):
+    own, sample = load_student(llama, device="cpu"), samples_of(place)[0].without_pictures()
     row = own.encode(sample, decision_weight=20.0)
     text = own.tokenizer.decode(row.answer_ids[row.weights == 20.0])
     assert sample.decision in text
@@ -122,29 +127,23 @@ def test_the_decision_can_weigh_more_and_come_first(place, built_once):
     assert np.array_equal(own.encode(sample).weights, np.ones(len(row.answer_ids), np.float32))
 
 
-def _changed(folder: Path, name: str, change: Any) -> None:
-    value = json.loads((folder / name).read_text())
-    change(value)
-    (folder / name).write_text(json.dumps(value))
-
-
 def _without_template(folder: Path) -> None:
     (folder / "chat_template.jinja").unlink(missing_ok=True)
-    _changed(folder, "tokenizer_config.json", lambda value: value.pop("chat_template", None))
+    change_json(folder / "tokenizer_config.json", lambda value: value.pop("chat_template", None))
 
 
 def _without_end(folder: Path) -> None:
     (folder / "chat_template.jinja").write_text("{% for m in messages %}{{ m.content }}{% endfor %}")
-    _changed(folder, "tokenizer_config.json", lambda value: value.pop("eos_token"))
+    change_json(folder / "tokenizer_config.json", lambda value: value.pop("eos_token"))
 
 
 def _remote_code(folder: Path) -> None:
     own = {"auto_map": {"AutoConfig": "code.Config"}, "model_type": "their_own"}
-    _changed(folder, "config.json", lambda value: value.update(own))
+    change_json(folder / "config.json", lambda value: value.update(own))
 
 
 def _unknown_family(folder: Path) -> None:
-    _changed(folder, "config.json", lambda value: value.update(model_type="qwen99"))
+    change_json(folder / "config.json", lambda value: value.update(model_type="qwen99"))
 
 
 def _missing_weights(folder: Path) -> None:
@@ -154,7 +153,7 @@ def _missing_weights(folder: Path) -> None:
 
 
 def _no_language_model(folder: Path) -> None:
-    _changed(folder, "config.json", lambda value: value.update(model_type="vit"))
+    change_json(folder / "config.json", lambda value: value.update(model_type="vit"))
 
 
 @each("change, words", [
@@ -182,11 +181,10 @@ def test_a_family_without_image_features_is_refused(place, built_once, tmp_path,
         run(place, tmp_path / "out", folder, max_steps=1)
 
 
-def test_a_head_that_scales_its_logits_is_refused(place, built_once, tmp_path, monkeypatch):
+def test_a_head_that_scales_its_logits_is_refused(place, llama, tmp_path, monkeypatch):
     """The chunked loss would be another one than the model's."""
     from transformers import LlamaForCausalLM
 
-    folder = built_once("family_llama", lambda root: make_family("llama", root / "llama")) / "llama"
     plain = LlamaForCausalLM.forward
 
     def scaled(self: Any, *given: Any, **more: Any) -> Any:
@@ -196,7 +194,7 @@ def test_a_head_that_scales_its_logits_is_refused(place, built_once, tmp_path, m
 
     monkeypatch.setattr(LlamaForCausalLM, "forward", scaled)
     with pytest.raises(ConfigError, match=r"changes its logits after the head.*LlamaForCausalLM"):
-        run(place, tmp_path / "out", folder, max_steps=1)
+        run(place, tmp_path / "out", llama, max_steps=1)
 
 
 def test_an_adapter_of_another_base_is_refused(place, tmp_path):
@@ -229,7 +227,7 @@ def test_a_template_of_the_settings_is_kept_with_the_adapter(place, tmp_path):
     assert (merged / "chat_template.jinja").read_text() == template
 
 
-def test_curves_go_to_the_loggers_of_accelerate(place, built_once, tmp_path, monkeypatch):
+def test_curves_go_to_the_loggers_of_accelerate(place, llama, tmp_path, monkeypatch):
     from accelerate import tracking
     from accelerate.utils import LoggerType
 
@@ -250,21 +248,20 @@ def test_curves_go_to_the_loggers_of_accelerate(place, built_once, tmp_path, mon
         def finish(self) -> None:
             seen.append("finish")
 
-    folder = built_once("family_llama", lambda root: make_family("llama", root / "llama")) / "llama"
     monkeypatch.setitem(tracking.LOGGER_TYPE_TO_CLASS, "tensorboard", Recorder)
     monkeypatch.setattr(tracking, "get_available_trackers", lambda: [LoggerType.TENSORBOARD])
-    run(place, tmp_path / "out", folder, max_steps=2, report_to=["tensorboard"], validation_samples=2)
+    run(place, tmp_path / "out", llama, max_steps=2, report_to=["tensorboard"], validation_samples=2)
     assert seen[:2] == [("distill.train", tmp_path / "out" / "curves"), "start"]
     assert [entry[0] for entry in seen[2:-1]] == [0, 1, 2, 2]
     assert {"loss", "learning_rate", "speed/tokens_per_s"} <= seen[3][1].keys()
     assert "validation/loss" in seen[2][1]
     assert seen[-1] == "finish"
     with pytest.raises(EnvironmentMissing, match=r"not installed.*wandb.*tensorboard.*pip install wandb"):
-        run(place, tmp_path / "other", folder, max_steps=1, report_to=["wandb"])
+        run(place, tmp_path / "other", llama, max_steps=1, report_to=["wandb"])
 
 
 @pytest.mark.slow
-def test_compiled_layers_give_the_same_losses(place, built_once, tmp_path, monkeypatch):
+def test_compiled_layers_give_the_same_losses(place, llama, tmp_path, monkeypatch):
     """The layers are traced and their gradients too; no C compiler is needed."""
     compiled: list[str] = []
     real = torch.nn.Module.compile
@@ -274,9 +271,8 @@ def test_compiled_layers_give_the_same_losses(place, built_once, tmp_path, monke
         real(self, **given, backend="aot_eager")
 
     monkeypatch.setattr(torch.nn.Module, "compile", traced)
-    folder = built_once("family_llama", lambda root: make_family("llama", root / "llama")) / "llama"
     for name, is_compiled in (("plain", False), ("compiled", True)):
-        run(place, tmp_path / name, folder, max_steps=3, learning_rate=1e-3, validation_samples=0, compile=is_compiled)
+        run(place, tmp_path / name, llama, max_steps=3, learning_rate=1e-3, validation_samples=0, compile=is_compiled)
     assert losses_of(tmp_path / "compiled") == pytest.approx(losses_of(tmp_path / "plain"), rel=1e-4)
     assert compiled == ["LlamaDecoderLayer"] * 2
 

@@ -105,8 +105,10 @@ def test_frames_are_scaled_to_the_size_that_pixels_in_the_texts_refer_to(place, 
     assert WindowDataset(tmp_path / "release")[0]["frames"].shape == (5, 3, 27, 48)
 
 
-def test_what_is_no_release_is_refused(place):
+def test_what_is_no_release_of_consecutive_frames_is_refused(place, built):
     with pytest.raises(InputError, match="contains no release"):
         WindowDataset(place / "tree")
     with pytest.raises(ConfigError, match="no split of this name"):
         WindowDataset(place / "release", split="tests")
+    with pytest.raises(InputError, match=r"release\.selection=windows"):
+        WindowDataset(built)

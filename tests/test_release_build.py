@@ -26,7 +26,7 @@ from caption.schema import CaptionConfig
 from caption.stage import stage as caption_stage
 from caption.stage.released import read_released
 from cosfly.formats.boxes import MapHeader
-from cosfly.formats.captions import read_captions, write_captions
+from cosfly.formats.captions import write_captions
 from cosfly.formats.frames import read_depth, read_instance, read_rgb
 from cosfly.formats.inspection import write_inspection
 from cosfly.formats.playback import read_track
@@ -35,7 +35,6 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import ConfigError, InputError, NothingKept, VerifyError
 from cosfly.runtime.json_io import read_json
 from cosfly.runtime.png import colours_of
-from distill.windows import WindowDataset
 from release.build.config import ReleaseConfig
 from release.build.shards import points_part
 from release.build.sources import Source
@@ -44,7 +43,7 @@ from release.card.render import render_card
 from release.record import ReleaseRecord, read_record
 from release.rules import group_by_size
 from release.verify.verify import verify
-from specimens import make_playback_tree
+from specimens import change_json, make_playback_tree
 
 POINTS = 14
 
@@ -158,12 +157,6 @@ def test_the_record_says_where_it_comes_from_and_nothing_of_this_machine(copy, t
 
 def first_flight(root: Path) -> Path:
     return find_tracks(root / "tree")[0]
-
-
-def change_json(path: Path, change) -> None:
-    value = json.loads(path.read_text())
-    change(value)
-    path.write_text(json.dumps(value))
 
 
 def cut(path: Path, num_bytes: int) -> None:
@@ -322,26 +315,6 @@ def test_windows_keep_the_pictures_of_captions(tmp_path):
     assert "are not all in the release" not in card
     everything = run(split_cfg(selection="all"), [source_of(tmp_path)], tmp_path / "all")
     assert read_record(everything / "release.json").history.captions.released == 2 * 86
-
-
-def test_a_long_track_is_released_as_in_the_paper(tmp_path):
-    """Of 850 frames 400 by a uniform stride, each with its caption in both languages, recomputed from the points."""
-    tree = make_playback_tree(tmp_path / "tree", 1, 850, width_px=32, height_px=18)
-    captions = caption_stage.run(CaptionConfig(), tree, tmp_path / "caption")
-    cfg = ReleaseConfig(**{**FREE, "pairs": "both"})
-    folder = run(cfg, [Source("one", tree, captions)], tmp_path / "r")
-    rows = table_of(folder, ["variant", "frame_index", "caption_en_reasoning_trace", "caption_zh_reasoning_trace"])
-    for variant in ("ORI", "aug_001"):
-        own = {row.pop("frame_index"): row for row in rows if row["variant"] == variant}
-        assert sorted(own) == [k * 849 // 399 for k in range(400)]
-        with_caption = {index for index, row in own.items() if None not in row.values()}
-        accepted = {c.frame_index for c in read_captions(captions) if (c.variant, c.status) == (variant, "accepted")}
-        assert with_caption == accepted & own.keys()
-        assert len(with_caption) > 350
-    report = verify(folder, level="rows", reader=read_released)
-    assert report.is_ok, str(report)
-    with pytest.raises(InputError, match=r"release\.selection=windows"):
-        WindowDataset(folder)
 
 
 def test_captions_of_several_lengths_of_windows_are_verified(tmp_path):

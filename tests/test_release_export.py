@@ -31,7 +31,7 @@ from release.export.lerobot import CHUNK, DATA_PATH, DEFAULTS, EPISODES_PATH, VE
 from release.export.stage import EXPORTS, ExportConfig, open_release
 from release.export.stage import run as export
 from release.record import read_record
-from specimens import PERSON_ID
+from specimens import PERSON_ID, change_json
 
 TEXTS = ("goal_says", "perturbation")  # joined to one text
 
@@ -210,18 +210,12 @@ def broken(dataset, tmp_path) -> Path:
     return shutil.copytree(dataset, tmp_path / "broken")
 
 
-def change_record(folder: Path, change) -> None:
-    record = json.loads((folder / "release.json").read_text())
-    change(record)
-    (folder / "release.json").write_text(json.dumps(record))
-
-
 @each(
     "path",
     ["../../secret.parquet", "/etc/passwd", "data/x.parquet", "data/train-0123456789ab-00000-of-00001.parquet/../x"],
 )
 def test_shards_that_escape_or_have_other_names_are_refused(broken, tmp_path, path):
-    change_record(broken, lambda record: record["shards"][0].update(path=path))
+    change_json(broken / "release.json", lambda record: record["shards"][0].update(path=path))
     with pytest.raises(InputError, match="the release is incomplete"):
         export(config("webdataset"), broken, tmp_path / "out")
 
@@ -240,7 +234,7 @@ def tell_size(folder: Path, path: Path) -> None:
         (shard,) = [shard for shard in record["shards"] if shard["path"].endswith(path.name)]
         shard["bytes"] = path.stat().st_size
 
-    change_record(folder, change)
+    change_json(folder / "release.json", change)
 
 
 @pytest.mark.parametrize(("change", "words"), [

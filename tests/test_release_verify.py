@@ -1,6 +1,5 @@
 """`release verify`."""
 
-import json
 import math
 import os
 import shutil
@@ -31,6 +30,7 @@ from release.build.sources import Source
 from release.columns import INTRINSICS
 from release.rules import split_flights
 from release.verify.verify import verify
+from specimens import change_json
 
 
 @pytest.fixture(scope="module")
@@ -261,9 +261,7 @@ def _rows_alone(honest: Path, out: Path, change) -> Path:
     path = out / record.shards[0].path
     schema = pq.read_schema(path)
     pq.write_table(pa.Table.from_pylist(shards[0], schema=schema), path)
-    entry = json.loads((out / "release.json").read_text())
-    entry["shards"][0]["bytes"] = path.stat().st_size
-    (out / "release.json").write_text(json.dumps(entry))
+    change_json(out / "release.json", lambda entry: entry["shards"][0].update(bytes=path.stat().st_size))
     return out
 
 

@@ -8,7 +8,7 @@
 
 Both with `pedestrians: {ground: paved, min_distance_m: 60, max_distance_m: 120}` and pictures as the flights have them.
 The student is a network of two hidden layers on the numbers of its prompt, behind a server that writes its decision
-into an answer. Beside each round stands a `control`, which gets as many old windows again as the round has new ones.
+into an answer.
 """
 
 import argparse
@@ -118,7 +118,7 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], help="settings of the flights")
     given = parser.parse_args()
     settings = [word for text in given.set for word in ("--set", text)]
-    first = x, y = samples(given.train / "caption/captions.jsonl", given.first)
+    x, y = samples(given.train / "caption/captions.jsonl", given.first)
     net, told = taught(x, y), []
     told.append(fly(net, given.test, given.out / "r0", settings))
     for number in range(1, given.rounds + 1):
@@ -128,10 +128,8 @@ def main() -> None:
         cosfly("fly", "--relabel", own, *places(given.train), "--out", made, *settings, *more)
         new = samples(made / "caption/captions.jsonl")
         x, y = np.vstack([x, new[0]]), np.append(y, new[1])
-        again = np.random.default_rng(number).integers(len(first[1]), size=len(y) - len(first[1]))
-        net, control = taught(x, y), taught(*(np.concatenate([part, part[again]]) for part in first))
+        net = taught(x, y)
         told.append(fly(net, given.test, given.out / f"r{number}", settings))
-        fly(control, given.test, given.out / f"control{number}", settings)
     board = [f"{path.name}={path}" for path in told]
     cosfly("leaderboard", *board, "--rounds", "--out", given.out / "rounds")
     for path in sorted(given.out.glob("*/score.json")):
