@@ -1,22 +1,36 @@
-"""Stage `caption` with the rule teacher: products, report page, tally, workers, resume, bad input."""
+"""Stage `caption`: products, report, resume and bad input; what becomes of conflicts, by strategies and by a judge."""
 
+import asyncio
+import contextlib
+import dataclasses
 import json
 import re
 import shutil
+import threading
 from collections import Counter
+from pathlib import Path
 
 import pytest
+from specimens_captions import VOCABULARY
+from tables import each
+from teacher_server import TeacherServer, is_mirror, obedient_answer
 
-from caption.schema import CaptionConfig
+from caption.schema import CaptionConfig, JudgeConfig, RepairConfig, WindowConfig
+from caption.stage import compare as compare_stage
 from caption.stage import stage
+from caption.stage.compare import Trial, compare, try_strategy
 from caption.stage.stage import run
+from caption.stage.window_loop import caption_window
 from caption.stage.windows import cut_windows
+from caption.teachers.judge import JUDGEMENTS, UNJUDGED, check_judge, gold_conflicts, judge_messages, parse_judgement
+from caption.teachers.teacher import RuleTeacher
 from caption.verification.actions import TABLE, measure
-from cosfly.formats.captions import read_captions
+from cosfly.formats.captions import Caption, Coc, read_captions
 from cosfly.formats.playback import read_track, write_track
 from cosfly.formats.tracks import find_tracks
-from cosfly.runtime.errors import NothingKept, ResumeError
-from specimens import change_json, make_playback_tree
+from cosfly.llm.contract import NoAnswer
+from cosfly.runtime.errors import NothingKept, ResumeError, TeacherError
+from specimens import change_json, make_flight, make_playback_tree
 
 
 @pytest.fixture(scope="module")
@@ -154,3 +168,204 @@ def test_captions_of_another_prompt_are_refused_by_name(tree, tmp_path, monkeypa
     monkeypatch.setitem(stage.PACKAGE_FILES, name, changed)
     with pytest.raises(ResumeError, match=f"the {name} has changed"):
         run(CaptionConfig(), tree, tmp_path / "out")
+
+
+CFG = CaptionConfig(window=WindowConfig(require_images=False))
+
+
+@each("treatment", ["keep", "repair", "drop"])
+def test_what_becomes_of_a_soft_conflict(treatment):
+    flight = dataclasses.replace(make_flight(60)[0], folder=Path("nowhere"))
+    windows = list(cut_windows(flight, CFG.window))
+
+    def captioned(repair: RepairConfig) -> list[Caption]:
+        cfg = CFG.model_copy(update={"repair": repair})
+        return [asyncio.run(caption_window(window, RuleTeacher(0), cfg, VOCABULARY)) for window in windows]
+
+    soft = [i for i, caption in enumerate(captioned(RepairConfig())) if caption.verdict == "SOFT_CONFLICT"]
+    assert soft
+    treated = captioned(RepairConfig(soft_conflict=treatment))
+    for caption in (treated[i] for i in soft):
+        if treatment == "keep":
+            assert (caption.status, caption.verdict, caption.repair) == ("accepted", "SOFT_CONFLICT", None)
+        elif treatment == "drop":
+            assert caption.drop_reason == "conflict"
+        else:
+            assert caption.repair is not None
+            assert caption.repair.first_verdict == "SOFT_CONFLICT"
+            if caption.status == "accepted":
+                assert caption.verdict == "CONSISTENT"
+            else:
+                assert caption.drop_reason == "no_reason"
+
+
+@each("strategy", ["anchored", "cascade"])
+def test_a_conflict_without_a_reason_for_its_label_counts_as_not_repaired(strategy):
+    cfg = CFG.model_copy(update={"repair": RepairConfig(hard_conflict="repair", soft_conflict="repair")})
+    track = dataclasses.replace(make_flight(60)[0], folder=Path("nowhere"))
+    windows = list(cut_windows(track, cfg.window))
+    trials = []
+    for window in windows:
+        with contextlib.suppress(NoAnswer):  # the first answer has no reason
+            trials.append(asyncio.run(try_strategy(window, RuleTeacher(0), cfg, VOCABULARY, strategy)))
+    trials = [trial for trial in trials if trial is not None]
+    repaired = [trial for trial in trials if trial.last is not None]
+    assert 0 < len(repaired) < len(trials)
+    assert compare(strategy, trials).consistency == round(len(repaired) / len(trials), 3)
+
+
+def test_a_window_without_a_conflict_is_asked_about_once(monkeypatch):
+    asked = []
+
+    async def agree(*args) -> None:
+        asked.append(args[-1])
+
+    monkeypatch.setattr(compare_stage, "try_strategy", agree)
+    assert asyncio.run(compare_stage._try_each(*[None] * 4)) == []
+    assert asked == [compare_stage.STRATEGIES[0]]
+
+
+def coc(text: str) -> Coc:
+    return Coc(critical_components=text, reasoning_trace="r", flight_decision="hover")
+
+
+def test_a_comparison_by_hand():
+    trials = [
+        Trial(coc("a b c"), coc("a b c"), "CONSISTENT", 1, 100),
+        Trial(coc("a b c"), coc("x y z"), "SOFT_CONFLICT", 2, 200),
+        Trial(coc("a b c"), None, "HARD_CONFLICT", 3, 300),
+    ]
+    found = compare("hint", trials)
+    assert (found.num_conflicts, found.repaired, found.consistency) == (3, 2, 0.333)
+    assert (found.asks_per_conflict, found.tokens_per_conflict, found.naturalness) == (2.0, 200.0, 0.625)
+    nothing = compare("hint", trials[2:])
+    assert (nothing.repaired, nothing.consistency, nothing.naturalness) == (0, 0.0, None)
+    assert [one.row[:4] for one in (found, nothing)] == [("hint", "2", "33.3 %", "62.5 %"), ("hint", "0", "0.0 %", "-")]
+
+
+def judging_server(answer, fault=None):
+    """A chat server whose text is `answer(body)`."""
+    server = TeacherServer(fault)
+    server.text = answer
+    return server
+
+
+@pytest.fixture(scope="module")
+def two_flights(tmp_path_factory):
+    return make_playback_tree(tmp_path_factory.mktemp("tree"), 2, 18)
+
+
+@each(("text", "verdict"), [
+    ('{"verdict": "FIX_LABEL", "reason": "the text argues for the label"}', "FIX_LABEL"),
+    ('```json\n{"verdict": "REJECT_REGEN", "reason": "wrong"}\n```', "REJECT_REGEN"),
+    ("ACCEPT_ALTERNATIVE", UNJUDGED),
+    ("", UNJUDGED),
+    ('{"verdict": "ACCEPT", "reason": "fine"}', UNJUDGED),
+    ('{"verdict": "ACCEPT_ALTERNATIVE"}', UNJUDGED),
+    ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": " "}', UNJUDGED),
+    ('{"verdict": ["ACCEPT_ALTERNATIVE"], "reason": "x"}', UNJUDGED),
+    ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": "x"} {"verdict": "REJECT_REGEN", "reason": "y"}', "REJECT_REGEN"),
+    ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": ', UNJUDGED),
+    ('["ACCEPT_ALTERNATIVE"]', UNJUDGED),
+])  # fmt: skip
+def test_reading_a_judgement(text, verdict):
+    assert parse_judgement(text)[0] == verdict
+
+
+def teacher_in_conflict(**options) -> TeacherServer:
+    """A teacher whose free decisions differ from the label in part of the windows; its text names its decision."""
+    server = TeacherServer(decision=lambda body: ("hover", "track_straight", "speed_up")[body["seed"] % 3], **options)
+
+    def text(body: dict) -> str:
+        answer = obedient_answer(server, body)
+        named = (
+            "因此应{decision}，使目标留在画面中。"
+            if is_mirror(body)
+            else "So the drone should {decision} in this case."
+        )
+        return json.dumps(answer | {"reasoning_trace": named})
+
+    server.text = text
+    return server
+
+
+def judged(two_flights, out, answer, **settings):
+    with judging_server(answer) as server, teacher_in_conflict() as teacher:
+        cfg = {"teacher": teacher.url, "judge": {"url": server.url, **settings}, "image": {"max_side_px": 32}}
+        path = run(CaptionConfig.model_validate(cfg), two_flights, out)
+        return list(read_captions(path)), json.loads((out / "caption_report.json").read_text()), server
+
+
+def test_a_hard_conflict_stays_one_whatever_the_judge_says(two_flights, tmp_path):
+    accept = '{"verdict": "ACCEPT_ALTERNATIVE", "reason": "looks fine"}'
+    captions, report, server = judged(two_flights, tmp_path / "out", lambda body: accept)
+    hard = [c for c in captions if c.repair]
+    soft = [c for c in captions if c.judge and not c.repair]
+    assert hard, "the specimens must hold a hard conflict"
+    assert soft, "the specimens must hold a soft conflict"
+    assert all(c.judge.overruled_by == "geometry" and c.verdict != "HARD_CONFLICT" for c in hard)
+    assert all(c.verdict == "SOFT_CONFLICT" and c.judge.overruled_by is None for c in soft)
+    assert report["judgements"] == {"ACCEPT_ALTERNATIVE": len(hard) + len(soft), "overruled_by_geometry": len(hard)}
+    assert len(server.bodies) == len(hard) + len(soft)  # consistent answers are not judged
+
+
+def test_a_label_is_put_in_where_the_text_allows_it(two_flights, tmp_path):
+    fix = '{"verdict": "FIX_LABEL", "reason": "replace it"}'
+    with TeacherServer(decision=lambda body: "hover") as teacher, judging_server(lambda body: fix) as judge:
+        cfg = CaptionConfig.model_validate({"teacher": teacher.url, "judge": {"url": judge.url}})
+        captions = list(read_captions(run(cfg, two_flights, tmp_path / "out")))
+    fixed = [c for c in captions if c.repair]
+    assert fixed
+    for caption in fixed:
+        assert caption.repair.rung == caption.repair.strategy == "fix_label"
+        assert (caption.repair.asks, caption.repair.first_decision) == (0, "hover")
+        assert caption.en.flight_decision == caption.zh.flight_decision == caption.label
+
+
+def test_a_label_is_not_put_under_a_text_that_states_another_decision(two_flights, tmp_path):
+    captions, _, _ = judged(
+        two_flights, tmp_path / "out", lambda body: '{"verdict": "FIX_LABEL", "reason": "replace it"}'
+    )
+    asked = [c for c in captions if c.judge]  # of the rule teacher, whose text names its decision
+    assert asked
+    assert all(c.judge.overruled_by == "text" and c.repair.rung == "anchored" for c in asked)
+
+
+def test_a_judges_tokens_count_in_the_budget_and_are_shown(two_flights, tmp_path):
+    out, reject = tmp_path / "out", '{"verdict": "REJECT_REGEN", "reason": "no"}'
+    # Each judgement: 1,000 tokens in, 100 out.
+    with judging_server(lambda body: reject) as server, teacher_in_conflict() as teacher:
+        settings = {
+            "teacher": teacher.url,
+            "judge": {"url": server.url, "concurrency": 1},
+            "endpoint": {"max_tokens": 64},
+            "image": {"max_side_px": 32},  # pictures count in the guess of the first request
+        }
+        with pytest.raises(TeacherError, match="captioning stopped, because the next request may exceed"):
+            run(CaptionConfig.model_validate(settings | {"budget": {"max_tokens": 10_000}}), two_flights, out)
+        assert 0 < len(server.bodies) * 1100 <= 10_000
+        whole = run(CaptionConfig.model_validate(settings), two_flights, out).read_bytes()
+        num_asked = len(server.bodies)
+        report = json.loads((out / "caption_report.json").read_text())
+        assert run(CaptionConfig.model_validate(settings), two_flights, tmp_path / "other").read_bytes() == whole
+        assert len(server.bodies) == 2 * num_asked  # what was judged before the budget stopped was not asked again
+    assert report["judge_tokens"] == {"prompt_tokens": 1000 * num_asked, "completion_tokens": 100 * num_asked}
+    assert f"{1000 * num_asked:,} in, {100 * num_asked:,} out" in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_check_tells_a_perfect_judge_and_one_that_always_says_the_same():
+    gold = [pair for judgement in JUDGEMENTS for pair in [g for g in gold_conflicts() if g.judgement == judgement][:12]]
+    right = {judge_messages(case, VOCABULARY)[1]["content"]: case.judgement for case in gold}
+
+    def checked(answer):
+        together = threading.Barrier(2)  # no answer comes before two have asked
+
+        def wait(number, body):
+            together.wait(60)
+
+        with judging_server(lambda body: json.dumps({"verdict": answer(body), "reason": "because"}), wait) as server:
+            found = asyncio.run(check_judge(JudgeConfig(url=server.url), VOCABULARY, gold))
+        return found.agreement, found.num_unjudged, found.num_moved, found.first_share
+
+    assert checked(lambda body: right[body["messages"][1]["content"]]) == (1.0, 0, 0, pytest.approx(1 / 3))
+    assert checked(lambda body: JUDGEMENTS[0]) == (pytest.approx(1 / 3), 0, 0, pytest.approx(1 / 3))

@@ -1,20 +1,29 @@
-"""Files that are never half written."""
+"""Files of a run: never half written, checked against the records of who made them; the PNG reader and writer."""
 
 import errno
+import io
 import os
+import shutil
+import zlib
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from pydantic import Field
+from specimens_png import png_around
 
 from cosfly.runtime import io as store
+from cosfly.runtime import run_dir
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import InputError, NothingKept, ResumeError, StorageError, VerifyError
-from cosfly.runtime.io import inside, write_bytes
+from cosfly.runtime.io import inside, sha256_bytes, sha256_file, write_bytes, write_checksums
 from cosfly.runtime.journal import Journal
-from cosfly.runtime.json_io import read_json, write_json
+from cosfly.runtime.json_io import dump_json, read_json, write_json
+from cosfly.runtime.png import areas_png, colours_png, floats_of, floats_png, parse_png
 from cosfly.runtime.run_dir import Failed, StageFolder, Tally, read_manifest, write_failures
 
 
@@ -223,3 +232,190 @@ def test_checksums_round_trip(tmp_path):
     (tmp_path / store.CHECKSUMS).write_text(f"{'0' * 64}  ../../evil\n")
     with pytest.raises(InputError, match="leads out"):
         store.read_checksums(tmp_path)
+
+
+def begin(out: Path, name: str, **inputs: Path) -> StageFolder:
+    return StageFolder.open(out, name, config=Config(), inputs=inputs, seed=0)
+
+
+def make(out: Path, name: str, files: dict[str, str], **inputs: Path) -> Path:
+    stage = begin(out, name, **inputs)
+    for file, text in files.items():
+        write_bytes(out / file, text.encode())
+    stage.finish([out / file for file in files], Tally(input=1, kept=1))
+    return out
+
+
+def make_tree(out: Path, text: str = "", **inputs: Path) -> Path:
+    stage = begin(out, "render", **inputs)
+    outputs = []
+    for flight in ("Town1/trajectory_1/ORI", "Town1/trajectory_2/ORI"):
+        folder = out / flight
+        files = {"trajectory.json": f"{flight}{text}", "frames_playback/frame_00000/rgb.png": f"picture of {flight}"}
+        for name, content in files.items():
+            write_bytes(folder / name, content.encode())
+        write_checksums(folder, {name: sha256_file(folder / name) for name in files})
+        outputs += [folder / "trajectory.json", folder / "checksums.sha256"]
+    stage.finish(outputs, Tally(input=2, kept=2))
+    return out
+
+
+@pytest.fixture
+def run(tmp_path) -> Path:
+    boxes = make(tmp_path / "simplify", "simplify", {"map.json": "boxes"}) / "map.json"
+    traces = make(tmp_path / "plan", "plan", {"traces.json": "flights"}, map=boxes) / "traces.json"
+    tree = make_tree(tmp_path / "render", simplified=boxes, traces=traces)
+    make(tmp_path / "caption", "caption", {"captions.jsonl": "a\nb\n"}, data=tree)
+    return tmp_path
+
+
+def inputs_of(run: Path) -> dict[str, Path]:
+    files = {"simplified": "simplify/map.json", "traces": "plan/traces.json", "data": "render"}
+    return {name: run / path for name, path in (files | {"captions": "caption/captions.jsonl"}).items()}
+
+
+def test_what_belongs_together_is_taken(run):
+    found = run_dir.checked_inputs(inputs_of(run))
+    assert found["simplified"].sha256 == sha256_bytes(b"boxes")
+    listed = read_json(run / "render/manifest.json")["outputs"]
+    assert found["data"].sha256 == sha256_bytes(dump_json(listed).encode()), "as in the records of earlier runs"
+
+
+def test_captions_of_another_tree_are_refused(run):
+    other = make_tree(run / "other", "of another seed")
+    with pytest.raises(
+        VerifyError, match=r"captions\.jsonl: captions.jsonl was made with another input .data.*got .*other"
+    ):
+        run_dir.checked_inputs(inputs_of(run) | {"data": other})
+    captions = make(run / "c2", "caption", {"captions.jsonl": "c"}, data=other) / "captions.jsonl"
+    two = {"0.data": run / "render", "0.captions": run / "caption/captions.jsonl"}
+    two |= {"1.data": other, "1.captions": captions}
+    run_dir.checked_inputs(two)
+    with pytest.raises(VerifyError, match="was made with another input"):
+        run_dir.checked_inputs(two | {"0.captions": captions})
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "stage.json"])
+def test_a_stage_without_its_records_is_not_finished(run, name):
+    (run / "caption" / name).unlink()
+    with pytest.raises(VerifyError, match=f"not finished, or its records are missing; got no {name}"):
+        run_dir.checked_inputs(inputs_of(run))
+    alone = run / "alone/captions.jsonl"
+    alone.parent.mkdir()
+    shutil.copy(run / "caption/captions.jsonl", alone)
+    run_dir.checked_inputs(inputs_of(run) | {"captions": alone})
+
+
+def test_a_name_that_no_record_can_hold(tmp_path):
+    path = tmp_path / os.fsdecode(b"bad\xff.json")
+    write_json(path, [])
+    with pytest.raises(InputError, match=r"bad\\udcff.json: the path of an input contains a name that is not UTF-8"):
+        begin(tmp_path / "out", "simplify", map=path)
+    assert not (tmp_path / "out").exists()
+
+
+def test_records_of_others_are_not_ours(tmp_path):
+    write_json(tmp_path / "manifest.json", {"name": "an app"})
+    write_json(tmp_path / "map.json", [])
+    run_dir.checked_inputs({"map": tmp_path / "map.json"})
+
+
+def test_a_tree_of_others_with_a_manifest_of_theirs_is_known_by_its_flights(tmp_path):
+    write_json(tmp_path / "manifest.json", {"name": "a data set"})
+    write_json(tmp_path / "flight/trajectory.json", 1)
+    before = run_dir.fingerprint(tmp_path)
+    write_json(tmp_path / "flight/trajectory.json", 2)
+    assert run_dir.fingerprint(tmp_path) != before
+
+
+def test_a_folder_without_checksums_is_as_good_as_one_with_them(run):
+    folder = run / "render/Town1/trajectory_1/ORI"
+    whole = run_dir.folder_digests(folder)
+    lines = (folder / "checksums.sha256").read_text().splitlines(keepends=True)
+    assert run_dir.digest_of(whole) == sha256_file(folder / "checksums.sha256")
+    (folder / "checksums.sha256").write_text(lines[0])
+    assert run_dir.folder_digests(folder) == whole, "what it leaves out is read"
+    (folder / "checksums.sha256").unlink()
+    assert run_dir.folder_digests(folder) == whole
+
+
+KIND_OF = {1: 0, 2: 4, 3: 2, 4: 6}
+
+
+def png_of(lines: np.ndarray, channels: int, level: int, strategy: int, piece: int) -> bytes:
+    """A PNG of filtered rows, (h, 1 + w * channels)."""
+    packer = zlib.compressobj(level, strategy=strategy)
+    packed = packer.compress(lines.tobytes()) + packer.flush()
+    width = (lines.shape[1] - 1) // channels
+    return png_around(packed, width, len(lines), KIND_OF[channels], piece=piece)
+
+
+def content(rng: np.random.Generator, height: int, stride: int) -> np.ndarray:
+    """Rows of noise, of few values and of runs, with filters as they come."""
+    lines = rng.integers(0, int(rng.choice([2, 6, 40, 256])), (height, stride), dtype=np.uint8)
+    if rng.random() < 0.5:
+        lines = np.repeat(lines, 7, axis=1)[:, :stride]
+    lines[:, 0] = rng.integers(0, 5, height)
+    return lines
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 90), st.sampled_from([1, 3, 4]), st.integers(0, 9),
+    st.sampled_from([zlib.Z_DEFAULT_STRATEGY, zlib.Z_FILTERED, zlib.Z_HUFFMAN_ONLY, zlib.Z_RLE, zlib.Z_FIXED]),
+)  # fmt: skip
+def test_pixels_are_a_librarys(seed, height, width, channels, level, strategy):
+    rng = np.random.default_rng(seed)
+    data = png_of(content(rng, height, 1 + width * channels), channels, level, strategy, int(rng.integers(40, 9000)))
+    expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED).reshape(height, width, channels)
+    if channels > 1:
+        expected[..., :3] = expected[..., 2::-1].copy()
+    np.testing.assert_array_equal(parse_png(data, "x").pixels(), expected)
+
+
+def test_a_picture_that_is_not_what_its_header_says_is_refused():
+    """Cut, too long, too short, a bomb, bytes behind the stream, and a filter that does not exist."""
+    lines = content(np.random.default_rng(0), 20, 61)
+    whole = png_of(lines, 3, 6, zlib.Z_RLE, 500)
+    assert len(parse_png(whole, "x").lines) == 20
+    wrong = lines.copy()
+    wrong[3, 0] = 5
+    packed = [
+        zlib.compress(lines.tobytes() + b"\0"), zlib.compress(lines.tobytes()[:-1]), zlib.compress(bytes(50_000_000)),
+        zlib.compress(lines.tobytes())[:-1], zlib.compress(wrong.tobytes()), b"",
+    ]  # fmt: skip
+    refused = [whole[:cut] for cut in (0, 7, 20, 33, 60, -1, -12, -20)] + [png_around(p, 20, 20) for p in packed]
+    for data in refused:
+        with pytest.raises(InputError):
+            parse_png(data, "x")
+
+
+def drawn(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
+    """Areas of one colour, some with texture, some of one row repeated."""
+    picture = np.repeat(rng.integers(0, 256, (height, 1 + width // 9, 3), dtype=np.uint8), 9, axis=1)[:, :width]
+    if rng.random() < 0.7:
+        picture[height // 3 :] = picture[height // 3]
+    if rng.random() < 0.7:
+        noise = rng.normal(0.0, float(rng.choice([0.5, 3.0, 60.0])), (height - height // 2, width, 3))
+        picture[height // 2 :] = np.clip(picture[height // 2 :] + noise, 0, 255).astype(np.uint8)
+    return picture
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 50), st.integers(1, 300))
+def test_what_is_written_is_read_by_libraries(seed, height, width):
+    rng = np.random.default_rng(seed)
+    picture = drawn(rng, height, width)
+    for data in (colours_png(picture), areas_png(*np.moveaxis(picture, 2, 0))):
+        np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], picture)
+        np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(data))), picture)
+        np.testing.assert_array_equal(parse_png(data, "x").pixels(), picture)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 5), (72, 128)])
+def test_floats_come_back_to_the_bit_and_any_library_finds_their_bytes(shape):
+    values = np.random.default_rng(0).integers(0, 2**32, shape, dtype=np.uint32).view(np.float32)
+    data = floats_png(values)
+    assert floats_of(data, "x").tobytes() == values.tobytes(), "also what is no number"
+    with Image.open(io.BytesIO(data)) as image:
+        assert np.asarray(image).view("<f4")[..., 0].tobytes() == values.tobytes()

@@ -1,4 +1,4 @@
-"""Studies: depth, the beam of TA*+Smooth, and zoom."""
+"""Studies of depth, beam and zoom; `cosfly bench`; `cosfly reproduce`."""
 
 import json
 
@@ -6,19 +6,30 @@ import numpy as np
 import pytest
 from specimens_planning import CANYON, town_of, walk_along
 from test_cosfly_render import needs_gl
-from test_cosfly_zoom import IN_THE_WALL
+from test_render_camera import IN_THE_WALL
 from test_renderers_contract import circling, write_inputs
+from toy_workers import make_counting_worker, stage_in
 from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.formats.boxes import write_boxes
 from cosfly.formats.pedestrian_paths import write_paths
+from cosfly.pipeline.bench import Bench, bench_run, run, tables, watchdog_figures
+from cosfly.pipeline.reproduce import OF_RELEASE, FigureReader, MissingFile, read_paper
+from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.contract import PlanConfig
-from cosfly.runtime.run_dir import read_manifest
+from cosfly.runtime.errors import ConfigError, InputError, ResumeError
+from cosfly.runtime.events import Event
+from cosfly.runtime.journal import Journal
+from cosfly.runtime.json_io import write_json
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Manifest, Tally, read_manifest
+from cosfly.runtime.worker import Item
 from cosfly.studies import beam
 from cosfly.studies.beam import FIGURES, PAPER_BEAM, Planned
 from cosfly.studies.depth import study_of
 from cosfly.studies.zoom import enlarged_fov_deg, tree_of
+from release.card.tables import SHAPES
 
 NEAR_M, FAR_M = 15.36, 38.32  # tab:depth_format_comparison
 
@@ -105,3 +116,133 @@ def test_the_target_grows_as_the_lens_does(tmp_path_factory, in_this_process):
     assert set(wide["by_flight"]) == {"path_000", "path_002"}
     counts = read_manifest(tree_of(out, LEVELS[0])).counts  # a bad flight is counted and stops no other
     assert (counts.input, counts.kept, dict(counts.failed)) == (3, 2, {"render": 1})
+
+
+def event(at_s: float, kind: str, **fields) -> Event:
+    return Event(at_s=at_s, event=kind, **fields)
+
+
+EVENTS = [
+    event(0, "began", workers=2),
+    event(0, "worker_started", worker=0, pid=1),
+    event(0, "worker_started", worker=1, pid=2),
+    event(
+        4, "probe", rss_mib={0: 100.0, 1: 120.0}, cores_used=1.0, disk_free_mib=1.0, gpu_percent=40.0, gpu_mib=2048.0
+    ),
+    event(10, "item_done", worker=0, item="a", status="kept", seconds=8.0, steps=40),
+    event(12, "worker_died", worker=1, pid=2, item="b", seconds=9.0, steps=30),
+    event(12, "retried", item="b", attempt=1),
+    event(13, "restarted", worker=1, pid=3),
+    event(14, "probe", rss_mib={0: 90.0}, cores_used=2.0, disk_free_mib=1.0, gpu_percent=50.0, gpu_mib=1024.0),
+    event(20, "item_done", worker=1, item="b", status="kept", seconds=5.0, steps=40),
+    event(20, "item_done", worker=0, item="c", status="dropped", seconds=5.0, steps=10),
+    event(20, "ended"),
+]
+MANIFEST = Manifest(stage="render", outputs=[], counts=Tally(input=3, kept=2, dropped={"far": 1}), seconds=20.0)
+
+
+def test_figures_of_a_run():
+    row = bench_run(EVENTS, MANIFEST, 2, counts_frames=True)
+    assert (row.attempted, row.successful, row.per_s) == (120, 80, 4.0)
+    assert (row.restarts, row.failed) == (1, 0)
+    assert (row.peak_memory_mib, row.cores_used) == (220.0, 1.5)
+    assert (row.gpu_percent, row.gpu_gib) == (45.0, 2.0)
+    without = [one.model_copy(update={"gpu_percent": None, "gpu_mib": None}) for one in EVENTS]
+    assert bench_run(without, MANIFEST, 2, counts_frames=True).gpu_percent is None
+    items = bench_run(EVENTS, MANIFEST, 2, counts_frames=False)
+    assert (items.attempted, items.successful) == (4, 2)
+
+
+def test_tables_are_those_of_the_paper():
+    about = {"cores_used": 1.5, "peak_memory_mib": 300.0, "restarts": 0, "failed": 0, "seconds": 10.0}
+    counts = [{"workers": n, "attempted": 100 * n, "successful": 100 * n} for n in (1, 2)]
+    bench = Bench.model_validate({"stage": "render", "cores": 2, "rows": [about | row for row in counts]})
+    head, *rows = tables(bench)["render on 2 cores"]
+    assert [dict(zip(head, row, strict=True))["speed-up"] for row in rows] == ["1.00x", "2.00x"]
+    assert rows[1][:6] == ("2", "10.0", "200", "200", "20.00", "2.00x")
+    assert "NVIDIA GPUs" not in tables(bench)
+    seen = bench.rows[1].model_copy(update={"gpu_percent": 58.6, "gpu_gib": 10.6})
+    bench.rows[1] = seen
+    assert tables(bench)["NVIDIA GPUs"][2] == ("2", "58.6", "10.6")
+
+
+def test_what_lost_workers_had_done_is_counted_and_left_out(tmp_path):
+    items = [Item("a", "once-die", num_steps=3), Item("b", num_steps=3)]
+    folder = stage_in(tmp_path)
+    finished = run_items(folder, items, make_counting_worker, (tmp_path,), workers=1, watch=Watch(heartbeat_s=0.2))
+    (tmp_path / "s/product").write_text("x")
+    folder.finish([tmp_path / "s/product"], finished.tally)
+    assert read_manifest(tmp_path / "s").facts["lost_steps"] == 3
+    launches, restarts, _, losses = watchdog_figures(tmp_path / "s")
+    assert (launches, restarts, losses) == (2, 1, {"worker_died": 1})
+
+
+def test_what_cannot_be_measured(tmp_path):
+    with pytest.raises(ConfigError, match=r"the benchmark cannot measure this stage.*simplify.*render"):
+        run(RunConfig(), tmp_path, tmp_path / "out", "simplify", [1])
+    asked = RunConfig.model_validate({"caption": {"teacher": "http://127.0.0.1:9"}})
+    with pytest.raises(ConfigError, match="its speed does not depend on workers"):
+        run(asked, tmp_path, tmp_path / "out", "caption", [1])
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/mine").touch()
+    with pytest.raises(ResumeError, match="not empty"):
+        run(RunConfig(), tmp_path, tmp_path / "out", "render", [1])
+    (tmp_path / "run.yaml").write_text("{}")
+    for counts in ("two", "0,1", ""):
+        answer = CliRunner().invoke(app, ["bench", str(tmp_path), "--out", str(tmp_path / "o"), "--workers", counts])
+        assert answer.exit_code == 2
+
+
+# All labels of tables and figures in the paper.
+PAPER_FIGURES = """
+    appendix_g_editor appendix_g_excluded_regions appendix_g_projection appendix_h_alg3d_measured
+    appendix_h_alg3d_projections appendix_h_four_axis_bar appendix_h_measured_trajectory_grid
+    appendix_h_tastar_muco_deltas bertscore_comparison bertscore_distribution box_categories building_circling
+    caption_pipeline coc_lengths coc_sample_frame confusion_matrix confusion_patterns consistency_verdict
+    cosfly_matrix_world_failure cumulative_trajectories dataset_sample decision_accuracy depth_comparison
+    dual_trajectory_pipeline fig17_stage_breakdown fig18_render_scaling fig19_watchdog gpu_utilization
+    grid_simplification joint_perturbation pedestrian_trajectory_generation per_map_completion
+    pipeline_flowchart pipeline_overview regen_strategy sample_generation simulator_restarts simworld_pipeline
+    simworld_step1 simworld_step2 simworld_step5 simworld_step6 sliding_window system_resources teaser
+    trajectory_comparison weather_gallery weather_pipeline zoom_demo zoom_fidelity
+"""
+PAPER_TABLES = """
+    algo_comparison appendix_h_extended_feasibility appendix_h_extended_ranking appendix_h_four_axis_scores
+    appendix_h_group_summary appendix_h_scope appendix_h_tastar_muco_delta appendix_h_tastar_muco_win_rates
+    augmentation_params augmentation_states baseline_protocol box_categories boxes_schema caption_pipeline
+    coc_actions coc_sample_en coc_sample_zh dataset_format_survey depth_format_comparison dist_stats
+    distillation_summary drone_params machine_configs ped_params planner_dist quality_stats render_scaling
+    simworld_simplify simworld_step4 simworld_step6_cli stage_breakdown tod_presets watchdog_reliability
+    weather_cli weather_coverage weather_heatmap weather_meta weather_modes weather_params_fields
+    weather_presets zoom_config zoom_conversion zoom_eval
+"""
+LABELS = [f"fig:{name}" for name in PAPER_FIGURES.split()] + [f"tab:{name}" for name in PAPER_TABLES.split()]
+
+
+def test_every_table_and_figure_of_the_paper_is_told_or_left_out_with_why():
+    paper = read_paper()
+    told = [*paper.settings, *paper.tables, *(table.more_labels for table in paper.tables.values())]
+    told += [SHAPES[key][1] for key in OF_RELEASE]
+    left = [label for labels in paper.left_out for label in labels.split(", ")]
+    both = {label for labels in told for label in labels.split(", ")}
+    assert (sorted(set(LABELS) - both - set(left)), sorted(both & set(left))) == ([], [])
+    assert sorted(label for label in {*both, *left} - set(LABELS) if label.startswith(("tab:", "fig:"))) == []
+    assert all(paper.left_out.values())
+
+
+def test_figures_are_found_by_keys_numbers_ids_and_stars(tmp_path):
+    write_json(tmp_path / "a.json", {"many": [{"id": "x", "ms": 1}, {"id": "y", "ms": 3}, {"id": "z"}], "none": {}})
+    with Journal(tmp_path / "items.jsonl") as journal:
+        journal.append({"id": "walk", "rss_mib": {"0": 2.0, "1": 3.0}})
+    reader = FigureReader([tmp_path / "absent", tmp_path], {"counts": {"a": 1, "b": 3}})
+    for place, expected in {
+        "a.json:many.0.ms": [1], "a.json:many.-1.id": ["z"], "a.json:many.y.ms": [3], "a.json:many.9.ms": [None],
+        "a.json:many.*.ms|mean,max": [2.0, 3], "a.json:many.x.ms,id + a.json:none": [1, "x", {}],
+        "items.jsonl:walk.rss_mib.1": [3.0], "items.jsonl:*.rss_mib|peak": [5.0], "a.json:none.*.ms|mean": [None],
+        "work:counts|shares": [{"a": 25.0, "b": 75.0}],
+    }.items():  # fmt: skip
+        assert reader.figures(place) == expected, place
+    with pytest.raises(MissingFile):
+        reader.figures("b.json:many")
+    with pytest.raises(InputError, match=r"a.json: many.\*.id"):
+        reader.figures("a.json:many.*.id|mean")

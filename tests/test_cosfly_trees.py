@@ -1,4 +1,5 @@
-"""Playback trees: strict and tolerant reading; the strictest public reader on ours, our readers on others'.
+"""Playback trees: strict and tolerant reading; the strictest public reader on ours, our readers on others'; the choice of
+tracks.
 
 QUIRKS is the place for the next thing that a foreign tree does otherwise.
 """
@@ -23,6 +24,7 @@ from caption.schema import CaptionConfig
 from caption.stage import stage as caption_stage
 from cosfly.formats.captions import Verdict, read_captions
 from cosfly.formats.inspection import read_inspection
+from cosfly.formats.places import TrackChoice
 from cosfly.formats.playback import read_track, write_track
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.geometry.splits import SPLITS
@@ -379,3 +381,34 @@ def test_older_names_and_any_even_time_step_are_read(clean, tmp_path):
     assert len(flight) == 6
     assert (flight.rotations_deg[:, 0] == 0).all()
     assert_allclose(np.diff(flight.time_s), 0.2)
+
+
+TOWNS, NAMES = ("Town01", "Town02_Opt"), ("trajectory_1777083733", "trajectory_1777090000")
+
+
+@pytest.fixture(scope="module")
+def of_towns(tmp_path_factory) -> Path:
+    return write_foreign_tree(
+        tmp_path_factory.mktemp("public") / "tree", towns=TOWNS, trajectories=NAMES, num_points=14
+    )
+
+
+def names(of_towns: Path, **choice) -> list[str]:
+    return [folder.relative_to(of_towns).as_posix() for folder in find_tracks(of_towns, TrackChoice(**choice))]
+
+
+def test_patterns_are_of_folders_and_those_above_them(of_towns):
+    for choice, count in (
+        ({}, 8), ({"match": ("Town01",)}, 4), ({"match": ("Town0[12]*/trajectory_177708*",)}, 4),
+        ({"match": ("*/ORI",)}, 4),
+        ({"match": ("Town01/trajectory_1777083733/ORI", "Town02_Opt/trajectory_1777090000/")}, 3),
+        ({"tracks": ("clean",)}, 4), ({"match": ("Town02*",), "tracks": ("perturbed",)}, 2),
+    ):  # fmt: skip
+        found = names(of_towns, **choice)
+        assert len(found) == count
+        assert set(found) <= set(names(of_towns))
+    words = r"no track folder in this directory matches the patterns of --flights; got Town9; .*Town01/trajectory_1777083733/ORI"
+    with pytest.raises(InputError, match=words):
+        names(of_towns, match=("Town9",))
+    with pytest.raises(InputError, match="this directory has no perturbed track among those that match --flights"):
+        names(of_towns, match=("*/ORI",), tracks=("perturbed",))

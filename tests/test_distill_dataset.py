@@ -1,7 +1,9 @@
-"""distill/prepare: captions to leak-free splits, and which windows stay."""
+"""Training sets: of captions, of both tracks of a flight, and windows of a release in tensors."""
 
 import json
+import pickle
 import re
+import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -10,15 +12,26 @@ import pytest
 from commands import invoke
 from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions, prepared
+from specimens_release import CFG, build, make_inspection
+from specimens_release import make_caption as released_caption
+from tables import each
 
-from cosfly.formats.captions import write_captions
-from cosfly.formats.playback import read_track
+from cosfly.formats.captions import read_captions, write_captions
+from cosfly.formats.frames import frame_name
+from cosfly.formats.inspection import write_inspection
+from cosfly.formats.playback import Track, read_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.splits import SPLITS
 from cosfly.inspection.blind_baseline import past_of
-from cosfly.runtime.errors import InputError, ResumeError
-from distill.prepare import stage
+from cosfly.runtime.errors import ConfigError, InputError, ResumeError
+from cosfly.runtime.run_dir import read_failures, read_manifest
+from cosfly.runtime.tables import rows_of
+from cosfly.viz.frame_views import Pictures, read_view
+from distill.prepare import dual_track, stage
+from distill.prepare.dual_track import DualTrackConfig, TrackSample, windows_of
 from distill.prepare.stage import PrepareConfig, RunSource, make_sample
 from distill.schema import Sample, open_split, resolve_trees, split_path
+from distill.windows import FACTS, FLAGS, WindowDataset
 from specimens import make_playback_tree
 
 
@@ -223,3 +236,182 @@ def test_the_library_of_data_sets_opens_it(tree, captions, tmp_path):
         row, sample = found[name][3], samples[3]
         found_values = row["prompt"], row["answer"], row["window"]
         assert found_values == (sample.prompt.model_dump(), sample.answer, list(sample.window))
+
+
+NUM_FRAMES = 24
+
+
+@pytest.fixture(scope="module")
+def four_walks(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("run") / "render"
+    return make_playback_tree(root, num_flights=4, num_points=NUM_FRAMES, towns=("Town01", "Town03"), with_images=False)
+
+
+@pytest.fixture(scope="module")
+def windows_of_tracks(four_walks, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("windows") / "set"
+    return dual_track.run(DualTrackConfig(val_fraction=0.25, test_fraction=0.25), [four_walks], out)
+
+
+def samples(windows_of_tracks: Path) -> dict[str, list[TrackSample]]:
+    return {split: [TrackSample(**row) for row in rows_of(split_path(windows_of_tracks, split))] for split in SPLITS}
+
+
+def run(four_walks: Path, out: Path, **settings: object) -> Path:
+    return dual_track.run(DualTrackConfig.model_validate(settings), [four_walks], out)
+
+
+@each(("num_frames", "expected"), [(9, []), (10, [0]), (12, [0]), (13, [0, 3]), (170, 54), (200, 64)])
+def test_the_papers_windows(num_frames, expected):
+    """Windows of 10 frames, one every 3: (N - 10) / 3 + 1, which the paper calls 50 to 60 of 170 to 200 frames."""
+    found = list(windows_of(num_frames, DualTrackConfig()))
+    assert (len(found) if isinstance(expected, int) else found) == expected
+
+
+def test_a_window_holds_both_tracks_frame_by_frame(four_walks, windows_of_tracks):
+    found = [sample for split in samples(windows_of_tracks).values() for sample in split]
+    assert len(found) == 4 * ((NUM_FRAMES - 10) // 3 + 1)
+    for sample in found:
+        folder = four_walks / sample.town / sample.trajectory
+        noisy, clean = read_track(folder / sample.variant), read_track(folder / "ORI")
+        assert sample.variant == "aug_001"
+        first = sample.window[0]
+        assert sample.window == tuple(range(first, first + 5))
+        assert sample.future == tuple(range(first + 5, first + 10))
+        assert sample.sample_id == f"{sample.trajectory}_aug_001_frame_{first + 4:05d}"
+        seen, after = list(sample.window), list(sample.future)
+        np.testing.assert_array_equal(sample.time_s, clean.time_s[seen + after])
+        np.testing.assert_array_equal(sample.observed_position_m, noisy.positions_m[seen])
+        np.testing.assert_array_equal(sample.observed_rotation_deg, noisy.rotations_deg[seen])
+        np.testing.assert_array_equal(sample.clean_position_m, clean.positions_m[seen])
+        np.testing.assert_array_equal(sample.future_position_m, clean.positions_m[after])
+        np.testing.assert_array_equal(sample.future_target_m, clean.targets_m[after])
+        # What was added is what the flight's record says was added.
+        np.testing.assert_allclose(
+            np.subtract(sample.observed_position_m, sample.clean_position_m),
+            noisy.perturbation.drone_m[seen],
+            atol=1e-9,
+        )
+
+
+def test_a_bad_flight_stops_no_other(tmp_path, four_walks):
+    own_tree = Path(shutil.copytree(four_walks, tmp_path / "run" / "render"))
+    flights = sorted(own_tree.glob("*/*/aug_001"))
+    (flights[0] / "trajectory.json").write_text("{")
+    shutil.rmtree(flights[1].parent / "ORI")
+    raw = json.loads((flights[2] / "trajectory.json").read_text())
+    raw["points"] = raw["points"][:20]
+    raw["points"][-1]["nav_waypoint"]["t1_world"] = None
+    (flights[2] / "trajectory.json").write_text(json.dumps(raw))
+    out = run(own_tree, tmp_path / "set")
+    counts = read_manifest(out).counts
+    assert (counts.input, counts.kept) == (4, 1)
+    assert counts.dropped == {"no_clean_flight": 1, "clean_flight_of_other_frames": 1}
+    assert counts.failed.total() == 1
+    assert flights[0].parent.name in read_failures(out / "failures.jsonl")[0].id
+
+
+def test_no_walk_is_in_two_splits(windows_of_tracks):
+    walks = [{sample.walk for sample in found} for found in samples(windows_of_tracks).values()]
+    assert all(walks)
+    assert sum(map(len, walks)) == len(set.union(*walks)) == 4
+    splits = json.loads((windows_of_tracks / "manifest.json").read_text())["splits"]
+    assert {split: facts["samples"] for split, facts in splits.items()} == {
+        split: len(found) for split, found in samples(windows_of_tracks).items()
+    }
+
+
+NUM_POINTS = 9
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    """tree/, captions.jsonl and release/dataset/ of three walks; the last caption of each flight was dropped."""
+    root = tmp_path_factory.mktemp("windows")
+    make_playback_tree(root / "tree", 3, NUM_POINTS, width_px=96, height_px=54)
+    dropped = {"status": "dropped", "drop_reason": "hard_conflict"}
+    captions = [
+        released_caption(flight, i, **(dropped if i == NUM_POINTS - 2 else {}))
+        for flight in map(read_track, find_tracks(root / "tree"))
+        for i in range(4, NUM_POINTS - 1)
+    ]
+    write_captions(root / "captions.jsonl", captions)
+    write_inspection(root / "inspect.json", make_inspection(root / "tree", {}))
+    build(root, root / "release", CFG.model_copy(update={"selection": "all"}))
+    return root
+
+
+def facts_in_tree(track: Track, at: list[int]) -> dict[str, np.ndarray]:
+    """The slow obvious version: what a release says of some frames of a track."""
+    target = track.target
+    cameras = [track.camera_at(index).intrinsic for index in at]
+    found = {
+        "time_s": track.time_s[at], "pose": np.hstack([track.positions_m[at], track.rotations_deg[at]]),
+        "intrinsics": np.array([(c[0, 0], c[1, 1], c[0, 2], c[1, 2]) for c in cameras]), "target": track.targets_m[at],
+        "visibility": target.visibility[at], "target_mask_bbox": np.full((len(at), 4), np.nan),
+    }  # fmt: skip
+    return found | {f"target_{n}": getattr(target, n)[at] for n in ("uv", "bbox", "depth_m", "in_view", "visible")}
+
+
+@pytest.mark.parametrize("language", ["en", "zh"])
+def test_windows_are_those_of_the_tree(place, language):
+    captions = [caption for caption in read_captions(place / "captions.jsonl") if caption.status == "accepted"]
+    windows = WindowDataset(place / "release", language=language)
+    found = {(p.flight[1:], p.window): windows[i] for i, p in enumerate(windows._places)}
+    assert len(found) == len(captions) == 6 * (NUM_POINTS - 6)
+    for caption in captions:
+        folder = place / "tree" / caption.town / caption.trajectory / caption.variant
+        window = found[folder.parts[-3:], tuple(caption.window)]
+        pictures = np.stack([read_view(folder / frame_name(index), "rgb") for index in caption.window])
+        assert np.array_equal(window["frames"], pictures.transpose(0, 3, 1, 2))
+        sentence = Pictures(("rgb",), caption.picture_px).sentence(language)
+        assert window["prompt"] == caption.prompt[language].told(sentence).model_dump()
+        texts = (caption.en if language == "en" else caption.zh).model_dump()
+        assert window["caption"] == texts | {"label": caption.label or "", "verdict": caption.verdict or ""}
+        facts = facts_in_tree(read_track(folder), list(caption.window))
+        assert window["facts"].keys() == facts.keys() == FACTS.keys()
+        for name, values in window["facts"].items():
+            assert np.allclose(values, facts[name], rtol=0, atol=1e-9, equal_nan=True), name
+            assert values.dtype == (bool if name in FLAGS else np.float64)
+
+
+def test_splits_of_a_release_share_no_walk_and_make_up_the_whole(place):
+    record = json.loads((place / "release/dataset/release.json").read_text())
+    names = sorted({shard["split"] for shard in record["shards"]})
+    parts = [WindowDataset(place / "release/dataset", split=name) for name in names]
+    assert sum(map(len, parts)) == len(WindowDataset(place / "release/dataset"))
+    assert len(WindowDataset(place)) == sum(map(len, parts))  # a run directory has its release below it
+    trajectories = [{found.flight[2] for found in part._places} for part in parts]
+    assert sum(map(len, trajectories)) == len(set().union(*trajectories))
+
+
+def test_pytorch_loads_them_with_two_workers(place):
+    torch = pytest.importorskip("torch")
+    windows = WindowDataset(place / "release")
+    assert len(pickle.loads(pickle.dumps(windows))) == len(windows)
+    loader = torch.utils.data.DataLoader(windows, batch_size=4, num_workers=2)
+    seen = []
+    for batch in loader:
+        assert (batch["frames"].shape[1:], batch["frames"].dtype) == ((5, 3, 54, 96), torch.uint8)
+        assert batch["facts"]["target"].shape[1:] == (5, 3)
+        assert batch["facts"]["target_visible"].dtype == torch.bool
+        seen += batch["sample_id"]
+    assert seen == [windows[i]["sample_id"] for i in range(len(windows))]
+
+
+def test_frames_are_scaled_to_the_size_that_pixels_in_the_texts_refer_to(place, tmp_path):
+    small = [caption.model_copy(update={"picture_px": (48, 27)}) for caption in read_captions(place / "captions.jsonl")]
+    (tmp_path / "tree").symlink_to(place / "tree")
+    write_captions(tmp_path / "captions.jsonl", small)
+    write_inspection(tmp_path / "inspect.json", make_inspection(place / "tree", {}))
+    build(tmp_path, tmp_path / "release", CFG.model_copy(update={"selection": "all"}))
+    assert WindowDataset(tmp_path / "release")[0]["frames"].shape == (5, 3, 27, 48)
+
+
+def test_what_is_no_release_of_consecutive_frames_is_refused(place, built):
+    with pytest.raises(InputError, match="contains no release"):
+        WindowDataset(place / "tree")
+    with pytest.raises(ConfigError, match="no split of this name"):
+        WindowDataset(place / "release", split="tests")
+    with pytest.raises(InputError, match=r"release\.selection=windows"):
+        WindowDataset(built)

@@ -147,8 +147,8 @@ def away_from_silhouettes(depth: np.ndarray, ids: np.ndarray) -> np.ndarray:
     return ~cv2.dilate((bent | differs).astype(np.uint8), np.ones((3, 3))).astype(bool)
 
 
-# The second renderer is an extra, and draws slowly; engines need a server, of one town (tests/test_render_carla.py),
-# and ids of objects of its own (tests/test_render_unrealcv.py).
+# The second renderer is an extra, and draws slowly; engines need a server, of one town (test_simulators_carla.py), and
+# ids of objects of its own (test_simulators_unrealcv.py).
 EMBEDDED = sorted(RENDERERS.keys() - set(SIMULATORS))
 NAMES = [pytest.param(name, marks=pytest.mark.slow if name == "pyrender" else ()) for name in EMBEDDED]
 

@@ -1,34 +1,150 @@
-"""Weather and time of day: presets, modes, seeds, pools, records, coverage; a picture changes, its labels never."""
+"""What a camera shows: zoom, weather and time of day, a target that can be made out, a map from above."""
 
 import hashlib
+import json
 import random
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from simulator_serving import AS_FOUND, as_client, carla_settings, serving
+from tables import each
 from test_cosfly_render import needs_gl
 from test_renderers_contract import HIP, circling, opened, pose_towards, street, write_inputs
 
-from cosfly.formats.boxes import MapHeader, make_box_map
-from cosfly.formats.frames import read_depth, read_instance, read_meta, read_rgb
+from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
+from cosfly.formats.frames import (
+    LEGIBLE_CONTRAST,
+    TargetMeta,
+    frame_name,
+    read_depth,
+    read_instance,
+    read_meta,
+    read_rgb,
+)
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback import read_track, write_track
+from cosfly.formats.roi import Backdrop
+from cosfly.formats.traces import DroneTrace
 from cosfly.formats.tracks import find_tracks
 from cosfly.formats.weather import TIMES, WEATHERS, WeatherParams, resolved
-from cosfly.geometry.axes import intrinsic_matrix
+from cosfly.geometry.axes import box_corners, intrinsic_matrix
 from cosfly.pipeline.runs import small_targets
 from cosfly.pipeline.settings import RunConfig
+from cosfly.render.backdrop import draw_backdrop
+from cosfly.render.camera import ZoomConfig, legibility, zoomed_deg
 from cosfly.render.contract import PosedPerson
 from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.render.weather import path_seed, read_pools, weather_of
 from cosfly.runtime.config import build
-from cosfly.runtime.errors import ConfigError
+from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.json_io import read_json
+from cosfly.viz.topview import TopView
+from release.columns import INTRINSICS, Placement, matrices_of, scalar_row
+from specimens import change_json, make_flight
+
+LEVELS = (110.0, 90.0, 60.0, 30.0)
+SMALL = {"width_px": 160, "height_px": 90, "town": "Street", "first_timestamp": 1776000000}
+DYNAMIC = {"mode": "dynamic", "part_s": 2.0, "ramp_s": 1.0}
+
+
+def zoomed(num_frames: int, **settings: float) -> np.ndarray:
+    zoom = ZoomConfig.model_validate({"mode": "dynamic", **settings})
+    return zoomed_deg(110.0, LEVELS, zoom, np.arange(num_frames) * 0.5, (), np.random.default_rng(0))
+
+
+def test_a_field_of_view_outside_0_to_180_is_an_error_and_any_inside_is_taken():
+    for fov in (0.0, -30.0, 180.0, 200.0, float("nan")):
+        with pytest.raises(ConfigError, match=r"fovs_deg"):
+            build(RenderConfig, {"fovs_deg": [90.0, fov]}, "test")
+    for fov in (0.1, 179.0):
+        assert build(RenderConfig, {"fovs_deg": [fov]}, "test").fovs_deg == (fov,)
+
+
+def test_a_flight_goes_from_level_to_level():
+    fovs = zoomed(60, part_s=10.0, ramp_s=2.0)
+    assert np.allclose(fovs[:21], 110.0)
+    for begin in (24, 44):
+        held = fovs[begin : begin + 16]
+        assert np.allclose(held, held[0])
+        assert round(held[0], 6) in LEVELS
+    assert fovs[20] != pytest.approx(fovs[24])
+    assert fovs[24] != pytest.approx(fovs[44])
+    focal = 1.0 / np.tan(np.radians(fovs) / 2.0)
+    assert focal[22] == pytest.approx(np.sqrt(focal[20] * focal[24])), "halfway the picture is halfway larger"
+
+
+def zooming(num_points: int = 8):
+    flight, _ = make_flight(num_points)
+    intrinsics = np.tile(flight.camera.intrinsic, (num_points, 1, 1))
+    intrinsics[:, [0, 1], [0, 1]] *= np.linspace(1.0, 2.0, num_points)[:, None]
+    return replace(flight, intrinsics=intrinsics)
+
+
+def test_the_cameras_of_a_flight_survive_the_file(tmp_path):
+    flight, folder = zooming(), tmp_path / "Town01/trajectory_1/ORI"
+    folder.mkdir(parents=True)
+    write_track(folder, flight)
+    found = read_track(folder)
+    np.testing.assert_array_equal(found.intrinsics, flight.intrinsics)
+    assert found.camera_at(7).focal_px == pytest.approx(2 * found.camera.focal_px)
+    assert found.fovs_deg[0] < found.fovs_deg[1] == pytest.approx(60.0)
+    row = scalar_row(found, 7, None, Placement("", "walk", "train"))
+    np.testing.assert_array_equal(
+        matrices_of(np.array([row["intrinsics"][name] for name in INTRINSICS])[None])[0], flight.intrinsics[7]
+    )
+    assert row["fov_deg"] == pytest.approx(found.camera_at(7).fov_deg, abs=1e-6)
+    change_json(folder / "trajectory.json", lambda raw: raw["points"][3]["camera"].update(intrinsic=[[0, 0, 0]] * 3))
+    with pytest.raises(InputError, match=r"points\[3\]\.camera\.intrinsic"):
+        read_track(folder)
+    assert any("points[3].camera" in issue for issue in read_track(folder, strict=False).issues)
+    write_track(folder, replace(flight, intrinsics=None))  # one camera is said once
+    assert all("camera" not in point for point in json.loads((folder / "trajectory.json").read_text())["points"])
+    assert read_track(folder).intrinsics is None
+
+
+@pytest.fixture(scope="module")
+def zoomed_tree(tmp_path_factory) -> tuple[Path, list[Path]]:
+    folder = tmp_path_factory.mktemp("zoomed")
+    inputs = write_inputs(folder / "inputs", [circling(16)])
+    cfg = RenderConfig.model_validate({**SMALL, "zoom": DYNAMIC})
+    return run(cfg, *inputs, folder / "render", seed=2), inputs
+
+
+@needs_gl
+def test_every_frame_tells_the_camera_it_was_drawn_with(zoomed_tree):
+    tree, _ = zoomed_tree
+    flights = [read_track(folder) for folder in find_tracks(tree)]
+    clean, shaken = flights
+    np.testing.assert_array_equal(clean.intrinsics, shaken.intrinsics)
+    assert len(np.unique(clean.intrinsics[:, 0, 0])) > 4
+    for flight in flights:
+        for i in range(len(flight)):
+            meta = read_meta(flight.frame_folder(i)).camera
+            camera = flight.camera_at(i)
+            assert meta.intrinsic == camera.intrinsic.tolist()
+            assert meta.fov_deg == pytest.approx(camera.fov_deg, abs=1e-6)
+            assert meta.focal_length_35mm_mm == pytest.approx(camera.focal_35mm_mm, abs=1e-6)
+
+
+def moved(trace: DroneTrace, name: str, frame: int, place: tuple[float, float, float]) -> DroneTrace:
+    places = getattr(trace, name).copy()
+    places[frame] = place
+    return replace(trace, **{name: places})
+
+
+IN_THE_WALL = moved(circling(4, "path_001"), "positions_m", 2, (-6.0, -16.0, 0.5))
+
 
 SIZE = (320, 180)
 RANDOM = {"weather_mode": "random_per_path"}
-SMALL = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0], "town": "Street", "first_timestamp": 1776000000}
+STREET = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0], "town": "Street", "first_timestamp": 1776000000}
 
 
 def config(**settings) -> RenderConfig:
@@ -167,7 +283,7 @@ def trees(tmp_path_factory):
     folder = tmp_path_factory.mktemp("weather")
     inputs = write_inputs(folder / "in", [circling(3, f"path_{k:03d}") for k in range(3)])
     return [
-        run(config(**SMALL, **settings), *inputs, folder / name, seed=5)
+        run(config(**STREET, **settings), *inputs, folder / name, seed=5)
         for name, settings in (("off", {}), ("random", RANDOM))
     ], inputs
 
@@ -228,3 +344,82 @@ def test_a_configuration_in_which_the_target_is_small_is_remarked_on():
     assert "lower than 16 px in pictures (follow " in line
     mostly = {"plan": {"styles": {"follow": 90, "top": 10}}, "render": {"width_px": 640, "height_px": 360}}
     assert small_targets(RunConfig.model_validate(mostly)) == []
+
+
+@each(
+    ("change", "is_legible"),
+    [({}, True), ({"visible": False}, False), ({"visibility": 0.2}, False), ({"contrast": 3.0}, False),
+        ({"contrast": None}, False), ({"bbox_2d": [0.0, 0.0, 6.0, 15.0]}, False), ({"bbox_2d": None}, False)],
+)  # fmt: skip
+def test_legible_is_what_the_bounds_say(change, is_legible):
+    change = {"visible": True, "visibility": 0.9, "bbox_2d": [0.0, 0.0, 8.0, 20.0], "contrast": 20.0} | change
+    target = TargetMeta.model_construct(**change)
+    told = legibility(target, change["contrast"])
+    assert told["legible"] == is_legible
+    assert told["height_px"] == (0.0 if target.bbox_2d is None else target.bbox_2d[3])
+
+
+@needs_gl
+def test_legibility_is_of_the_picture_as_written(tmp_path):
+    boxes, simplified, traces = write_inputs(tmp_path, [circling(3)])
+    size = {"width_px": 320, "height_px": 180, "fovs_deg": [60], "tracks": ["clean"]}
+    fog = {"thickest": {"cloudiness": 90.0, "precipitation": 0.0, "fog_density": 100.0, "fog_distance": 1.0}}
+    (tmp_path / "fog.yaml").write_text(json.dumps({"presets": fog}))
+    dim = {"weather_mode": "fixed", "weather_name": "thickest", "tod_name": "noon",
+           "weather_pool": str(tmp_path / "fog.yaml")}  # fmt: skip
+    found = {}
+    for name, more in (("plain", {}), ("fog", dim)):
+        tree = run(build(RenderConfig, size | more, "test"), boxes, simplified, traces, tmp_path / name)
+        (folder,) = find_tracks(tree)
+        flight = read_track(folder)
+        found[name] = flight.legibility_at(1)
+        told = read_meta(folder / frame_name(1)).target
+        assert found[name] == told.model_dump(include=set(found[name]))
+        assert flight.target.visible.all()
+    assert found["plain"]["legible"] is True
+    assert found["fog"]["legible"] is False
+    assert float(found["fog"]["contrast"]) < LEGIBLE_CONTRAST
+
+
+def pond(ground_z_m: float, yaw_deg: float) -> BoxMap:
+    half = [(60.0, 45.0, 0.1), (30.0, 12.0, 0.1)]
+    centers = [(3.0, 1.0, ground_z_m - 0.1), (8.0, -4.0, ground_z_m - 0.1)]
+    kinds = [KINDS["Terrain"], KINDS["Water"]]
+    turns = [(0.0, 0.0, 0.0), (0.0, yaw_deg, 0.0)]
+    return make_box_map(centers, half, turns, kinds, [1, 2], MapHeader(name="pond", ground_z_m=ground_z_m))
+
+
+@pytest.mark.parametrize(("ground_z_m", "yaw_deg"), [(0.0, 0.0), (37.0, 25.0)])
+def test_the_ground_lies_where_the_world_has_it(ground_z_m, yaw_deg):
+    box_map = pond(ground_z_m, yaw_deg)
+    view = TopView(-55.3, 41.2, 3.0, (331, 250))  # no whole number of tiles
+    picture = draw_backdrop(RenderConfig(), box_map, view)
+    assert picture.shape == (250, 331, 3)
+    is_water = picture[..., 2] > picture[..., 0]
+    corners = box_corners(box_map.centers[1], box_map.half_extents[1], np.radians(yaw_deg))[[0, 2, 6, 4]]
+    expected = np.zeros((250, 331), np.uint8)
+    cv2.fillPoly(expected, [np.round(view.pixels(corners) * 16 - 8).astype(np.int32)], 1, shift=4)
+    wrong = is_water != (expected == 1)
+    edge = cv2.dilate(expected, np.ones((3, 3))) != cv2.erode(expected, np.ones((3, 3)))
+    assert is_water.sum() == pytest.approx(4 * 30 * 12 * 9, rel=0.01)
+    assert not (wrong & ~edge).any(), "no pixel beyond one from the shore"
+
+
+@pytest.mark.slow
+def test_carla_gives_the_same_picture_by_the_same_way(tmp_path):
+    pytest.importorskip("carla")
+    boxes = tmp_path / "boxes_3d.json"
+    write_boxes(boxes, street())
+    pictures = []
+    with serving(street(), tmp_path / "town") as port:
+        for words in ([], ["--backend", "carla", f"--set=render.carla.port={port}"]):
+            out = tmp_path / f"above{len(words)}.png"
+            command = [sys.executable, "-m", "cosfly", "maps", "roi-backdrop", "--map", boxes, "--out", out, *words]
+            subprocess.run([*command, "--bounds", "-30", "-30", "40", "30", "--pixels-per-m", "2"], check=True)
+            above = Backdrop.read(out)
+            assert above.frame() == {"west": -30.0, "north": 30.0, "width": 70.0, "height": 60.0}
+            pictures.append(above.picture.astype(int))
+        assert as_client(carla_settings, port) == AS_FOUND, "the server is left as it was found"
+    assert pictures[0].std() > 20
+    ours, theirs = (picture[..., 2].reshape(-1) for picture in pictures)
+    assert np.corrcoef(ours, theirs)[0, 1] > 0.95, "in blue, which the server's haze and shadows change least"

@@ -1,0 +1,341 @@
+"""Pages and pictures: the viewer in a browser, the views of a frame for teachers, students and people, boxes over a frame."""
+
+import asyncio
+import base64
+import hashlib
+import io
+import json
+import re
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from browser import browser
+from PIL import Image
+from specimens_captions import VOCABULARY
+from specimens_distill import WINDOW, make_caption
+from tables import each
+from test_cosfly_render import needs_gl
+from test_renderers_contract import circling, street, write_inputs
+from typer.testing import CliRunner
+
+from caption.schema import CaptionConfig, ImageConfig, Window, WindowConfig
+from caption.stage.window_loop import caption_window
+from caption.stage.windows import cut_windows
+from caption.teachers.prompts import make_question, question_messages
+from caption.teachers.teacher import RuleTeacher, encode_frame
+from cosfly.cli import app
+from cosfly.formats.boxes import make_box_map, write_boxes
+from cosfly.formats.captions import PICTURES_MARK, Language, write_captions
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
+from cosfly.llm.student_chat import encoded_image
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import run as render
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.io import read_checksums
+from cosfly.viz.gallery import four_panels
+from cosfly.viz.viewer import run
+from distill.inference.stage import EngineAnswers, InferConfig, Inputs
+from distill.prepare.stage import PrepareConfig, make_sample
+from distill.schema import Sample
+from specimens import make_playback_tree
+
+NUM_POINTS = 24
+EVIL = (
+    "</script><script>window.hacked=1</script><img src=x onerror='window.hacked=2'>"
+    '\u202e\x1b]0;owned\x07 {"a":1} <!-- ${1}'
+)
+
+
+REPAIRED = {
+    "strategy": "cascade", "rung": "anchored", "outcome": "repaired", "asks": 2, "first_decision": "hover",
+    "first_verdict": "HARD_CONFLICT",
+}  # fmt: skip
+ODD = {
+    7: {"verdict": "HARD_CONFLICT"},
+    8: {"repair": REPAIRED},
+    9: {"status": "dropped", "drop_reason": "hard_conflict"},
+    10: {"verdict": "SOFT_CONFLICT"},
+}
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory) -> Path:
+    """A run of four flights in two towns with a map and captions: a conflict, a repaired, a dropped, a hostile one."""
+    folder = tmp_path_factory.mktemp("runs") / "one"
+    tree = make_playback_tree(folder / "render", 2, NUM_POINTS, width_px=96, height_px=54, towns=("Town01", "Town02"))
+    captions, read = [], {"values": {"en": {"values_filled": 2}, "zh": {"values_filled": 1, "values_contradicted": 1}}}
+    for flight in map(read_track, find_tracks(tree)):
+        for i in range(WINDOW - 1, NUM_POINTS - 1):
+            more = {"checks": read if i % 2 else {}} | ODD.get(i, {})
+            caption = make_caption(flight.town, flight.trajectory, flight.variant, i, **more)
+            evil = {"en": caption.en.model_copy(update={"reasoning_trace": EVIL}), "label": EVIL}
+            captions.append(caption.model_copy(update=evil if i == 10 else {}))
+    (folder / "caption").mkdir()
+    write_captions(folder / "caption/captions.jsonl", captions)
+    (folder / "simplify").mkdir()
+    town = make_box_map(
+        [[0, 0, 5], [4, 9, 1], [900, 0, 5]],
+        [[5, 5, 5], [2, 1, 1], [5, 5, 5]],
+        np.zeros((3, 3)),
+        [KINDS["Buildings"], KINDS["Vegetation"], 3],
+    )
+    write_boxes(folder / "simplify/step2_simplified.json", town)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(run_folder, tmp_path_factory) -> Path:
+    return run(run_folder, tmp_path_factory.mktemp("page") / "viewer.html", most_frames=12, picture_px=64)
+
+
+def data_of(text: str) -> dict:
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)[1])
+
+
+def test_a_run_is_shown_as_it_is(page):
+    data = data_of(page.read_text(encoding="utf-8"))
+    assert len(data["flights"]) == 4
+    assert {flight["map"] for flight in data["flights"]} == {"one/Town01", "one/Town02"}
+    assert {box["kind"] for box in data["maps"]["one/Town01"]} == {"Buildings", "Vegetation"}  # the third is 900 m away
+    flight = data["flights"][1]
+    found = flight["track"], flight["num_frames"], flight["num_captions"]
+    assert found == ("perturbed", NUM_POINTS, 19)
+    by_index = {frame["index"]: frame["caption"] for frame in flight["frames"]}
+    assert (len(by_index), by_index[7]["verdict"]) == (12, "HARD_CONFLICT")
+    assert by_index[9]["dropped"] == "hard_conflict"
+    assert by_index[7]["values"] == {"values_filled": 3, "values_matched": 0, "values_contradicted": 1}
+    for frame in flight["frames"]:
+        assert set(frame["pictures"]) == {"rgb", "depth", "segmentation"}
+        pixels = cv2.imdecode(np.frombuffer(base64.b64decode(frame["pictures"]["rgb"]), np.uint8), cv2.IMREAD_COLOR)
+        assert pixels.shape[:2] == (36, 64)
+
+
+def test_the_page_asks_for_nothing_and_names_its_script(page):
+    text = page.read_text(encoding="utf-8")
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
+    script = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script[-1].encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in policy
+    assert "default-src 'none'" in policy
+    assert "unsafe-eval" not in policy
+    assert len(re.findall(r"<script", text)) == 2  # the data and ours: no text opened a third
+    assert not re.search(r"(src|href)=[\"']?(https?:)?//", text)
+    assert "innerHTML" not in script[-1]
+    assert all(f"{word}(" not in script[-1] for word in ("insertAdjacentHTML", "document.write", "eval", "fetch"))
+
+
+def test_of_many_tracks_whole_trajectories_are_shown(run_folder, tmp_path):
+    two = data_of(run(run_folder, tmp_path / "two.html", most_tracks=2, most_frames=1).read_text(encoding="utf-8"))
+    assert len({flight["group"] for flight in two["flights"]}) == 1
+    assert [len(flight["frames"]) for flight in two["flights"]] == [1, 1]
+    assert any("2 of 4 tracks are shown" in note for note in two["notes"])
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("chromium") / "profile"
+    folder.mkdir()
+    with browser(folder) as opened:
+        yield opened
+
+
+COUNT = "document.getElementById('count').textContent"
+# How many pixels of the map have a colour of the page's style.
+PIXELS = """(name) => {
+  const pen = new OffscreenCanvas(1, 1).getContext("2d"), plan = document.getElementById("plan");
+  pen.fillStyle = getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  pen.fillRect(0, 0, 1, 1);
+  const wanted = pen.getImageData(0, 0, 1, 1).data;
+  const all = plan.getContext("2d").getImageData(0, 0, plan.width, plan.height).data;
+  let count = 0;
+  for (let i = 0; i < all.length; i += 4) count += [0, 1, 2].every((k) => all[i + k] === wanted[k]);
+  return count;
+}"""
+
+
+@pytest.mark.slow
+def test_the_page_opens_offline_and_shows_pictures_map_and_captions(tab, page):
+    tab.requests.clear()
+    tab.said.clear()
+    tab.open(page)
+    assert tab.run("document.body.dataset.ready") == "yes"
+    assert tab.run(COUNT) == "48 of 48 frames"
+    assert tab.run("[...document.images].length") == 3
+    found = tab.run("Promise.all([...document.images].map((one) => one.decode().then(() => one.naturalWidth)))")
+    assert found == [64, 32, 32]
+    assert "2 boxes, 3 trajectories" in tab.run("document.getElementById('plan').getAttribute('aria-label')")
+    assert [url for url in tab.requests if not url.startswith(("data:", "about:"))] == [page.absolute().as_uri()]
+    assert tab.said == []
+    for name in ("--person", "--clean", "--perturbed", "--house"):  # both tracks, the person and a house are on the map
+        tab.wait(f"({PIXELS})('{name}') > 0")
+
+
+@pytest.mark.slow
+def test_hostile_text_is_text(tab, page):
+    tab.said.clear()
+    tab.open(page, "#q=window.hacked")
+    assert tab.run(COUNT) == "4 of 48 frames"
+    assert tab.run("typeof window.hacked") == "undefined"
+    shown = tab.run("document.getElementById('caption').textContent")
+    assert "<script>window.hacked=1</script>" in shown
+    assert "\\u202e" in shown
+    assert "\u202e" not in shown
+    assert tab.run("document.querySelectorAll('#caption img, #caption script').length") == 0
+    tab.open(page, "#town=%3Cimg%20src%3Dx%3E&flight=%22&frame=NaN&q=%00%3C")
+    assert tab.run("document.body.dataset.ready") == "yes"
+    assert tab.said == []
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 10, with_augmented=False)
+
+
+# Views, layout, largest side: every count of views, orders that are not the usual one, both layouts and sizes.
+SHAPES = [
+    (("rgb",), "separate", 640), (("depth", "rgb"), "tiled", 40), (("segmentation", "rgb", "depth"), "separate", 40),
+    (("depth", "segmentation", "rgb"), "tiled", 640),
+]  # fmt: skip
+NAMES = {
+    "en": {"RGB": "rgb", "depth": "depth", "segmentation": "segmentation", "enlarged": "middle"},
+    "zh": {"RGB": "rgb", "深度": "depth", "分割": "segmentation", "放大": "middle"},
+}
+
+
+def told_views(text: str, language: Language) -> tuple[str, ...]:
+    places = {view: text.find(name) for name, view in NAMES[language].items() if name in text}
+    return tuple(sorted(places, key=places.__getitem__))
+
+
+def told_count(text: str, language: Language) -> int:
+    several = {"en": r"given as (\d+) pictures", "zh": r"每帧依次给出 (\d+) 张"}[language]
+    found = re.search(several, text)
+    if found is None:
+        assert {"en": "given as one picture", "zh": "每帧给出一张图像"}[language] in text
+    return int(found.group(1)) if found else 1
+
+
+def told_size(text: str) -> tuple[int, int]:
+    [(width, height)] = re.findall(r"(\d+) [x×] (\d+) (?:px|像素)", text)
+    return int(width), int(height)
+
+
+def sent_pictures(messages: list[dict]) -> list[np.ndarray]:
+    parts = [part["image_url"]["url"] for part in messages[1]["content"] if part["type"] == "image_url"]
+    return [np.asarray(Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB")) for url in parts]
+
+
+@pytest.fixture(scope="module")
+def window(tree) -> Window:
+    return next(cut_windows(read_track(find_tracks(tree)[0]), WindowConfig()))
+
+
+def ask(window: Window, cfg: ImageConfig) -> tuple[dict[Language, str], list[np.ndarray]]:
+    question = make_question(window.observed, cfg, "prose", VOCABULARY)
+    encode = partial(encoded_image, encoding="png")
+    frames = [encode_frame(folder, question.pictures, encode) for folder in window.observed.frame_folders]
+    messages, _ = question_messages(question, frames)
+    assert messages[1]["content"][-1]["text"] == question.asked["en"].user
+    return {language: prompt.user for language, prompt in question.asked.items()}, sent_pictures(messages)
+
+
+def test_a_teacher_is_told_what_it_is_shown(window):
+    middle = [(("middle",), "separate", 640), (("rgb", "middle", "depth"), "tiled", 40)]
+    for views, layout, max_side_px in [*SHAPES, *middle]:
+        cfg = ImageConfig(modalities=views, layout=layout, max_side_px=max_side_px)
+        told, pictures = ask(window, cfg)
+        for language, text in told.items():
+            assert told_views(text, language) == views
+            assert len(pictures) == 5 * told_count(text, language)
+            width, height = told_size(text)
+            assert (width, height) == ((64, 36) if max_side_px == 640 else (40, 22))
+            across = len(views) if layout == "tiled" else 1
+            assert {picture.shape for picture in pictures} == {(height, across * width, 3)}
+
+
+@each(("views", "layout", "max_side_px"), SHAPES)
+def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, window, views, layout, max_side_px):
+    image = {"layout": layout, "max_side_px": max_side_px, "depth_range_m": 40.0}
+    cfg = CaptionConfig.model_validate({"image": image, "window": {"require_images": True}})
+    caption = asyncio.run(caption_window(window, RuleTeacher(0), cfg, VOCABULARY))
+    _, shown = ask(window, cfg.image)
+    if layout == "tiled":
+        shown = [part for picture in shown for part in np.split(picture, 3, axis=1)]
+    teachers = [dict(zip(cfg.image.modalities, shown[3 * i : 3 * i + 3], strict=True)) for i in range(5)]
+    assert caption.status == "accepted"
+    for language in ("en", "zh"):
+        sample = make_sample(caption, language, PrepareConfig(modalities=views))
+        assert isinstance(sample, Sample)
+        text = sample.prompt.user
+        pictures = [picture for frame in sample.frames for picture in sample.pictures.read(tree / frame)]
+        assert PICTURES_MARK not in text
+        assert told_views(text, language) == views
+        assert len(pictures) == 5 * told_count(text, language) == 5 * len(views)
+        assert told_size(text) == pictures[0].shape[1::-1]
+        assert ("40 m and beyond" in text or "40 米及更远" in text) == ("depth" in views)
+        expected = [teachers[i][view] for i in range(5) for view in views]
+        for picture, wanted in zip(pictures, expected, strict=True):
+            assert np.array_equal(picture, wanted)
+        inputs, cfg = Inputs((), {"": tree}, "", None), InferConfig(engine="endpoint")
+        request = EngineAnswers(None, None, inputs, cfg)._request(sample)  # as `vllm` is asked too
+        kinds = [part.get("text", "picture") for part in request.messages[1]["content"]]
+        assert kinds == [word for i in range(5) for word in (f"t{i}:", *["picture"] * len(views))] + [text]
+        for picture, wanted in zip(sent_pictures(request.messages), expected, strict=True):
+            assert np.array_equal(picture, wanted)
+
+
+SETTINGS = {
+    "width_px": 320, "height_px": 180, "fovs_deg": [60.0], "town": "Street", "tracks": ["clean"],
+    "first_timestamp": 1776000000,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def trees(tmp_path_factory) -> dict[bool, Path]:
+    folder = tmp_path_factory.mktemp("overlay")
+    inputs = write_inputs(folder / "inputs", [circling(3)])
+    return {
+        debug: render(
+            RenderConfig.model_validate({**SETTINGS, "debug": debug}), *inputs, folder / str(debug) / "render"
+        )
+        for debug in (True, False)
+    }
+
+
+def frame_of(tree: Path) -> Path:
+    return read_track(find_tracks(tree)[0]).frame_folder(1)
+
+
+@needs_gl
+def test_debug_pictures_are_written_where_they_are_asked_for(trees):
+    assert not list(trees[False].rglob("debug.png"))
+    (folder,) = find_tracks(trees[True])
+    named = [name for name in read_checksums(folder) if name.endswith("debug.png")]
+    assert len(named) == len(list(folder.rglob("debug.png"))) == 3
+    for name in ("rgb.png", "depth_float32.png", "instance.png"):
+        assert (frame_of(trees[True]) / name).read_bytes() == (frame_of(trees[False]) / name).read_bytes()
+
+
+@needs_gl
+def test_four_pictures_of_a_frame(trees, tmp_path):
+    result = CliRunner().invoke(app, ["view", str(trees[True]), "--frame", "best", "--out", str(tmp_path / "a.png")])
+    assert result.exit_code == 0, result.output
+    assert Image.open(tmp_path / "a.png").size == (640, 2 * (180 + 36))
+    name = four_panels(trees[False], tmp_path / "b.png", box_map=street())
+    assert name in result.output
+    for frame in (name, str(trees[False] / name)):
+        assert four_panels(trees[False], tmp_path / "b.png", frame=frame, box_map=street()) == name
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), np.asarray(Image.open(tmp_path / "b.png")))
+
+
+@needs_gl
+def test_without_boxes_there_is_one_clear_error(trees, tmp_path):
+    with pytest.raises(InputError, match=r"has no debug\.png.*--map.*render\.debug=true"):
+        four_panels(trees[False], tmp_path / "a.png")
+    with pytest.raises(InputError):
+        four_panels(trees[True], tmp_path / "a.png", frame="../../elsewhere")

@@ -1,0 +1,278 @@
+"""A student: its chat templates, merged weights, fused norms and the chunked loss, each against the libraries'.
+
+The templates here were written for these tests; they branch where the public ones of Qwen3.5, 3.6 and 3.8 do: texts
+are trimmed, thoughts of the last answer are kept and others dropped, 3.6 can keep them (`preserve_thinking`), 3.8 keeps
+them unless told otherwise, takes thoughts from their own field alone, and begins its system text with how much to think
+unless thinking is off.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import later  # noqa: F401  # skips without torch
+import numpy as np
+import pytest
+from later import qwen, safetensors, torch
+from specimens_distill import make_adapter
+from specimens_students import (
+    FAST,
+    MAX_PIXELS,
+    features_of,
+    load,
+    losses_of,
+    nats_of,
+    pixels_of,
+    run,
+    samples_of,
+    trees_of,
+)
+
+from cosfly.runtime.errors import InputError
+from distill.inference import merge
+from distill.student import qwen3_5
+from distill.student.chat import EncodedSample, Processor, padded
+from distill.student.features import Tensors
+from distill.student.model import Student, load_student
+from distill.student.random_student import make_random_student
+from distill.training import fit
+from distill.training import stage as train
+from distill.training.loss import answer_loss, chunked_loss
+from distill.training.settings import TrainConfig
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+TEMPLATE = """
+{%- macro words(content) -%}
+    {%- if content is string -%}{{ content }}
+    {%- else -%}
+        {%- for part in content -%}
+            {%- if part.type == 'image' -%}{{- '<|vision_start|><|image_pad|><|vision_end|>' -}}
+            {%- else -%}{{ part.text }}
+            {%- endif -%}
+        {%- endfor -%}
+    {%- endif -%}
+{%- endmacro -%}
+{%- set place = namespace(last_question=-1) -%}
+{%- for message in messages if message.role == 'user' -%}
+    {%- set place.last_question = messages.index(message) -%}
+{%- endfor -%}
+{%- set effort = '' -%}
+EFFORT
+{%- for message in messages -%}
+    {%- set text = words(message.content) | trim -%}
+    {%- if message.role == 'system' and effort -%}{%- set text = effort + '\\n\\n' + text -%}{%- endif -%}
+    {%- if message.role == 'assistant' -%}
+        {%- set thought = message.reasoning_content if message.reasoning_content is string else '' -%}
+        FROM_TEXT
+        {%- if KEEPS or loop.index0 > place.last_question -%}
+            {%- set text = '<think>\\n' + (thought | trim) + '\\n</think>\\n\\n' + text -%}
+        {%- endif -%}
+    {%- endif -%}
+    {{- '<|im_start|>' + message.role + '\\n' + text + '<|im_end|>\\n' -}}
+{%- endfor -%}
+{%- if add_generation_prompt -%}
+    {{- '<|im_start|>assistant\\n<think>\\n' -}}
+    {%- if enable_thinking is defined and enable_thinking is false -%}{{- '\\n</think>\\n\\n' -}}{%- endif -%}
+{%- endif -%}
+"""
+FROM_TEXT = """
+        {%- if not thought and '</think>' in text -%}
+            {%- set thought = text.split('</think>')[0].split('<think>')[-1] -%}
+            {%- set text = text.split('</think>')[-1].lstrip('\\n') -%}
+        {%- endif -%}"""
+EFFORT = """
+{%- if enable_thinking is undefined or enable_thinking is true -%}
+    {%- set effort = 'Reasoning effort is set to ' ~ (reasoning_effort | default('xhigh')) ~ '.' -%}
+{%- endif -%}"""
+
+
+def template(keeps_thoughts: str, from_text: str = FROM_TEXT, effort: str = "") -> str:
+    return TEMPLATE.replace("KEEPS", keeps_thoughts).replace("FROM_TEXT", from_text).replace("EFFORT", effort)
+
+
+TEMPLATES = {
+    "3.5": template("false"),
+    "3.6": template("(preserve_thinking is defined and preserve_thinking)"),
+    "3.8": template("(preserve_thinking | default(true))", "", EFFORT),
+}
+
+
+@pytest.fixture(params=TEMPLATES)
+def processor(place, request) -> Processor:
+    own = load(place)
+    return Processor(own.tokenizer, own.library, TEMPLATES[request.param])
+
+
+def test_prompt_answer_and_end_are_the_whole_chat(place, processor):
+    assert processor.end_of_answer == "<|im_end|>\n"
+    for sample in samples_of(place)[:4]:
+        prompt = processor.prompt_text(sample)
+        assert prompt + sample.answer + processor.end_of_answer == processor.chat_text(sample)
+        assert prompt.endswith("<|im_start|>assistant\n<think>\n\n</think>\n\n")  # the thought is over before it begins
+        assert "Reasoning effort" not in prompt
+        assert prompt.count("<|image_pad|>") == len(sample.images) == 5
+        row = processor.encode(sample)
+        taught = processor.tokenizer.decode([*row.prompt_ids, *row.answer_ids])
+        pictures = "<|image_pad|>" * 2  # 64 x 36 px, which the processor rounds to two squares of 32 px
+        assert taught == prompt.replace("<|image_pad|>", pictures) + sample.answer + "<|im_end|>"
+
+
+def test_a_template_that_writes_something_else_ends_before_the_first_step(place, tmp_path):
+    """One that signs every answer: what is taught would not be what the student's own template writes."""
+    import shutil
+
+    folder = shutil.copytree(place / "student", tmp_path / "student")
+    path = folder / "chat_template.jinja"
+    text = path.read_text()
+    signed = text.replace(
+        "{{ '<|im_end|>\n' }}", "{%- if m.role == 'assistant' %}{{ ' -- end' }}{%- endif %}{{ '<|im_end|>\n' }}"
+    )
+    assert signed != text
+    path.write_text(signed)
+    with pytest.raises(InputError, match="the training text differs from that of the chat template"):
+        train.run(TrainConfig(**FAST), place / "set", [place / "tree"], folder, tmp_path / "out")
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory) -> Path:
+    folder = make_random_student(tmp_path_factory.mktemp("base") / "student", seed=2)
+    # Any file that servers need.
+    shutil.copy(folder / "generation_config.json", folder / "video_preprocessor_config.json")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def adapter(base, tmp_path_factory) -> Path:
+    return make_adapter(base, tmp_path_factory.mktemp("adapter") / "adapter")
+
+
+@pytest.mark.parametrize("changes", [{}, {"r": 3, "use_rslora": True}, {"target_modules": ["q_proj", "up_proj"]}])
+def test_merged_as_peft_merges(base, tmp_path, changes):
+    folder = make_adapter(base, tmp_path / "adapter", **changes)
+    expected = load_student(base, device="cpu", adapter=folder).model.merge_and_unload().state_dict()
+    found = safetensors.load_file(merge.run(base, folder, tmp_path / "out") / "model.safetensors")
+    before = safetensors.load_file(base / "model.safetensors")
+    changed = {name for name in found if not torch.equal(found[name], before[name])}
+    assert changed
+    assert not any("visual" in name for name in changed)
+    for name, tensor in found.items():
+        torch.testing.assert_close(tensor, expected[name], rtol=1e-6, atol=1e-6)
+
+
+def norms(dtype) -> torch.nn.ModuleDict:
+    torch.manual_seed(0)
+    found = torch.nn.ModuleDict({"plain": qwen.Qwen3_5RMSNorm(48), "gated": qwen.Qwen3_5RMSNormGated(48)})
+    with torch.no_grad():
+        for parameter in found.parameters():
+            parameter.add_(0.3 * torch.randn(48))
+    return found.to(dtype)
+
+
+def computed(found: torch.nn.ModuleDict, dtype, autocast: bool) -> list[torch.Tensor]:
+    """Outputs, and gradients of inputs and weights."""
+    torch.manual_seed(1)
+    x, gate = (torch.randn(3, 7, 48, dtype=dtype).requires_grad_() for _ in range(2))
+    with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        outputs = [found["plain"](5.0 * x), found["gated"](0.1 * x, gate)]
+    sum((output.float() ** 3).sum() for output in outputs).backward()
+    return [*outputs, x.grad, gate.grad, *(p.grad for p in found.parameters())]
+
+
+@pytest.mark.parametrize(("dtype", "autocast", "tolerance"), [
+    ("float32", False, 1e-5), ("float32", True, 1e-5), ("bfloat16", False, 0.03), ("bfloat16", True, 0.03),
+])  # fmt: skip
+def test_fused_norms_are_the_librarys_with_their_gradients(dtype, autocast, tolerance):
+    dtype = getattr(torch, dtype)
+    plain, fused = norms(dtype), norms(dtype)
+    qwen3_5.fuse_norms(fused)
+    assert {type(module).__name__ for module in fused.values()} == {"FusedNorm", "FusedGatedNorm"}
+    assert fused.state_dict().keys() == plain.state_dict().keys()
+    for found, wanted in zip(computed(fused, dtype, autocast), computed(plain, dtype, autocast), strict=True):
+        assert found.dtype == wanted.dtype
+        assert (found - wanted).float().norm() <= tolerance * wanted.float().norm()
+
+
+# Adam divides by what gradients were before, so rounding grows from step to step, with a rate that makes a student
+# learn in 12 steps sooner than with usual ones.
+FOUR = {"max_steps": 4, "validation_samples": 0, "learning_rate": 1e-3}
+
+
+def seen(place: Path, own: Student, count: int) -> tuple[list[EncodedSample], list[Tensors]]:
+    samples = samples_of(place)[:count]
+    return [own.encode(s, MAX_PIXELS) for s in samples], features_of(own, samples, trees_of(place))
+
+
+@pytest.mark.parametrize("chunk", [7, 1000])
+def test_the_chunked_loss_is_the_plain_one_with_its_gradients(chunk):
+    generator = torch.Generator().manual_seed(chunk)
+    hidden = torch.randn(37, 16, generator=generator, requires_grad=True)
+    head = torch.randn(101, 16, generator=generator, requires_grad=True)
+    targets = torch.randint(0, 101, (37,), generator=generator)
+    weights = torch.rand(37, generator=generator)
+    total = chunked_loss(hidden, head, targets, weights, chunk=chunk, dtype=torch.float32)
+    (3.0 * total).backward()
+    found = hidden.grad.clone(), head.grad.clone()
+    hidden.grad = head.grad = None
+    plain = torch.nn.functional.cross_entropy(hidden @ head.T, targets, reduction="none")
+    (3.0 * (plain * weights).sum()).backward()
+    assert float(total.detach()) == pytest.approx(float((plain * weights).sum().detach()), rel=1e-6)
+    assert torch.allclose(found[0], hidden.grad, atol=1e-5)
+    assert torch.allclose(found[1], head.grad, atol=1e-5)
+
+
+def test_loss_and_gradients_are_those_of_the_library(place):
+    own = train.add_adapter(load(place), TrainConfig(**FAST), 0)
+    with torch.no_grad():  # a fresh adapter's second matrix is zero, which would hide the first one's gradient
+        for name, parameter in own.model.named_parameters():
+            if "lora_B" in name:
+                parameter.normal_(0, 0.02, generator=torch.Generator().manual_seed(len(name)))
+    (row,), features = seen(place, own, 1)
+    learning = {name: p for name, p in own.model.named_parameters() if p.requires_grad}
+    total = answer_loss(own, [row], features, 16)
+    (total / len(row.answer_ids)).backward()
+    found = {name: p.grad.clone() for name, p in learning.items()}
+    own.model.zero_grad()
+    inputs = {name: torch.from_numpy(array) for name, array in padded(own, [row]).items() if name != "weights"}
+    inputs["attention_mask"] = torch.ones_like(inputs["input_ids"])
+    library = own.model(**inputs, **pixels_of(own, samples_of(place)[:1], trees_of(place))).loss
+    library.backward()
+    assert float(total.detach()) / len(row.answer_ids) == pytest.approx(float(library.detach()), rel=1e-5)
+    for name, parameter in learning.items():
+        assert torch.allclose(found[name], parameter.grad, atol=1e-5, rtol=1e-3), name
+
+
+def test_a_sample_in_a_batch_has_its_loss_alone(place):
+    own = load(place)
+    rows, features = seen(place, own, 4)
+    parts = [features[5 * place : 5 * place + 5] for place in range(4)]
+    # Lengths far apart, one beyond a piece of 64 tokens of the linear attention.
+    rows[1] = replace(rows[1], answer_ids=np.tile(rows[1].answer_ids, 3), weights=np.tile(rows[1].weights, 3))
+    rows[2] = replace(rows[2], answer_ids=rows[2].answer_ids[:5], weights=np.full(5, 0.5, np.float32))
+    together = nats_of(own, rows, features)
+    alone = [nats_of(own, [row], part)[0] for row, part in zip(rows, parts, strict=True)]
+    assert together == pytest.approx(alone, rel=1e-5)
+    with torch.no_grad():
+        for row, part, nats in zip(rows, parts, alone, strict=True):
+            total = float(answer_loss(own, [row], part, 64))
+            assert total == pytest.approx(float(row.weights[0]) * nats, rel=1e-6)
+
+
+@pytest.mark.parametrize(("changes", "logit_chunk"), [
+    ({"batch_size": 3}, 512),
+    ({"gradient_checkpointing": True}, 9),
+    pytest.param({"data_workers": 2}, 512, marks=pytest.mark.slow),
+])  # fmt: skip
+def test_what_changes_how_and_not_what_gives_the_same_losses(place, plain, tmp_path, monkeypatch, changes, logit_chunk):
+    monkeypatch.setattr(fit, "LOGIT_CHUNK", logit_chunk)
+    run(place, tmp_path / "out", **{**FOUR, **changes})
+    assert losses_of(tmp_path / "out") == pytest.approx(plain, rel=1e-5)
+
+
+@pytest.fixture(scope="module")
+def plain(place, tmp_path_factory) -> list[float]:
+    out = tmp_path_factory.mktemp("plain") / "out"
+    run(place, out, **FOUR)
+    return losses_of(out)
