@@ -208,13 +208,6 @@ def test_clearance_has_a_floor(workplace, beside_m, codes):
     assert bool(found) == bool(codes)
 
 
-def test_a_post_between_two_poses_is_a_collision(workplace):
-    positions_m = read_track(first_flight(workplace)).positions_m
-    i = int(np.argmax(np.linalg.norm(np.diff(positions_m, axis=0), axis=1)))
-    write_map(workplace, (0.5 * (positions_m[i] + positions_m[i + 1]), [0.01, 0.01, 0.01]))
-    assert findings(workplace, InspectConfig(clearance_min_m=0.0))["ORI"]["collision"] == "error"
-
-
 @pytest.mark.parametrize(("up_m", "is_hit"), [(0.0, False), (3.0, True)])
 def test_the_way_between_frames_is_the_one_that_was_flown(workplace, up_m, is_hit):
     folder = first_flight(workplace)

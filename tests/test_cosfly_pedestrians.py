@@ -130,16 +130,6 @@ def test_a_walk_keeps_every_promise(number, dt_s):
     assert (ground.parts[y, x] == ground.parts[y[0], x[0]]).all()
 
 
-def test_a_walk_depends_on_its_own_random_numbers_only():
-    cfg = PedestriansConfig()
-    ground = walkable_ground(town(), cfg)
-    texts = [
-        dump_json(make_pedestrian("p", ground, cfg, rng_for(seed, "pedestrians", name)).trajectory.as_json())
-        for seed, name in ((0, "a"), (0, "a"), (0, "b"), (1, "a"))
-    ]
-    assert (texts[0], len(set(texts))) == (texts[1], 3)
-
-
 def test_a_detour_is_given_up_and_counted():
     # A wall of 90 m with a way round it at one end only: near the other end, 10 m across are 150 m on foot.
     ground = ground_of("\n".join(["1" * 100] * 5 + ["0" * 95 + "1" * 5] + ["1" * 100] * 5))

@@ -18,7 +18,7 @@ from simulator_serving import serving
 from specimens_foreign import write_foreign_tree
 from specimens_slopes import sloped_city
 from teacher_server import TeacherServer
-from test_caption_doctor import patient
+from test_caption_servers import patient
 from test_cosfly_map_kinds import node, write_world
 from test_distill_evaluate import make_encoder
 from test_docs import ALL, PAGES, blocks
