@@ -41,9 +41,7 @@ from cosfly.maps.synthetic import SyntheticConfig, load
 bench.TURNS, bench.census_town = 1, lambda name, seed: load(SyntheticConfig(), seed)
 """),
     ("bench_planning", "--maps a --planners track_astar muco", r"the same loss from the same start",
-             SMALL_TOWN + "scenes.NUM_WALKS, bench.WALKS = 2, bench.WALKS.model_copy(update={'num_paths': 2})"),
-    ("bench_ray", "--rounds 1", r"ray / local, by rounds: .*differences: \[\]",
-             "bench.TOWN = ('pedestrians.num_paths=2', 'render.fovs_deg=[60]', *bench.TOWN[1:])"),
+             SMALL_TOWN + "scenes.NUM_WALKS, bench.WALKS = 1, bench.WALKS.model_copy(update={'num_paths': 1})"),
     ("bench_release", "8 --rounds 1", r"build: \d+ % of the speed of the copy",
              "bench.NUM_POINTS, bench.NUM_POOL, bench.FRAMES_RELEASED, bench.SIZE_PX = 8, 1, 4, (160, 90)"),
     ("bench_render", "--frames 2", r"CPU ms a frame", SMALL_TOWN),

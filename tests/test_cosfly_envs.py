@@ -139,7 +139,7 @@ def test_unknown_arguments_are_refused_in_a_line():
             gymnasium.make(FOLLOW, **arguments)
 
 
-# Programs of others, unmodified: the second needs the path of CleanRL's ppo.py in CLEANRL_PPO.
+# Programs of others, unmodified.
 TRAINERS = {
     "statistics and SyncVectorEnv": """
 import gymnasium, numpy as np
@@ -160,22 +160,14 @@ for actions in ("decisions", "velocities"):
     PPO("MultiInputPolicy", envs, n_steps=96, batch_size=32, n_epochs=1, device="cpu").learn(192)
     envs.close()
 """,
-    "tyro": """
-import os, runpy, sys
-sys.argv = ["ppo.py", "--env-id", "cosfly.envs:cosfly/FollowFlat-v0", "--total-timesteps", "192", "--num-envs", "2",
-            "--num-steps", "96", "--no-cuda"]
-runpy.run_path(os.environ["CLEANRL_PPO"], run_name="__main__")
-""",
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TRAINERS)
 def test_wrappers_and_trainers_of_others_run_unmodified(name, tmp_path):
-    package = name if name in ("stable_baselines3", "tyro") else "gymnasium"
-    pytest.importorskip(package, reason=f"{package} is not installed")
-    if name == "tyro" and not os.environ.get("CLEANRL_PPO"):
-        pytest.skip("CLEANRL_PPO does not name CleanRL's ppo.py")
+    if name == "stable_baselines3":
+        pytest.importorskip(name)
     path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
     done = subprocess.run(
         [sys.executable, "-c", TRAINERS[name]], cwd=tmp_path, capture_output=True, text=True, check=False,

@@ -9,7 +9,6 @@ import pytest
 from commands import invoke
 from hypothesis import given
 from hypothesis import strategies as st
-from specimens_rows import make_row
 from tables import each
 
 from cosfly.formats.frames import (
@@ -24,11 +23,36 @@ from cosfly.geometry.trajectory_metrics import derivative_rms, length_m
 from cosfly.runtime.json_io import read_json
 from release.card.render import render_card
 from release.card.tables import tables_of
-from release.columns import CONTRACT, POINT, POSE
+from release.columns import CAPTION_FIELDS, CONTRACT, COUNTED, POINT, POSE, SCALAR_NAMES
 from release.counting import Sum, action_class, count_track, numbers_of
 from release.reading import TrackRows
 from release.record import read_record
 from release.rules import select_frames
+
+WORDS = {
+    "decision": "hover", "label": "ascend", "label_from": "flight", "verdict": "SOFT_CONFLICT", "teacher_kind": "rules",
+}  # fmt: skip
+
+
+def make_row(i: int, variant: str = "ORI", trajectory: str = "trajectory_1", **change) -> dict:
+    """A frame of a drone that flies 3 m a frame to the east, 20 m above a person; the perturbed track 1 m beside."""
+    shift = 0.0 if variant == "ORI" else (-1.0) ** i
+    place = {"x_m": 3.0 * i, "y_m": shift, "z_m": 20.0}
+    row = dict.fromkeys(SCALAR_NAMES) | {
+        "sample_id": f"{trajectory}_{variant}_frame_{i:05d}", "run": "one", "town": "Town01",
+        "trajectory": trajectory, "variant": variant,
+        "track": "clean" if variant == "ORI" else "perturbed", "style": "follow", "pace": "walk",
+        "frame_index": i, "time_s": 0.5 * i,
+        "width_px": 64, "height_px": 36, "fov_deg": 60.0, "pose": dict.fromkeys(POSE, 0.0) | place,
+        "drone_offset": dict.fromkeys(POSE, 0.0) | {"y_m": shift},
+        "target": dict(zip(POINT, (3.0 * i, 0.0, 0.0), strict=True)),
+        "visibility": 0.75, "is_perturbed": variant != "ORI", "target_in_view": True,
+        "target_visible": True, "has_caption": i % 2 == 0,
+    }  # fmt: skip
+    if row["has_caption"]:
+        row |= dict.fromkeys((*COUNTED, *CAPTION_FIELDS), "word") | WORDS | {"values_filled_en": 2}
+    return row | change
+
 
 TRACKS = [
     TrackRows(f"one/Town01/trajectory_{k}/{variant}", [make_row(i, variant, f"trajectory_{k}") for i in range(12)])
