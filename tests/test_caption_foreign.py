@@ -41,11 +41,6 @@ ZH = {
 
 
 @pytest.fixture(scope="module")
-def tree(tmp_path_factory) -> Path:
-    return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 20, with_augmented=False)  # 11 windows
-
-
-@pytest.fixture(scope="module")
 def rules(tree, tmp_path_factory) -> list[Caption]:
     return list(read_captions(run(CaptionConfig(), tree, tmp_path_factory.mktemp("rules") / "out")))
 

@@ -245,8 +245,8 @@ BYSTANDER_COLUMNS = np.array(
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    return read_track(find_tracks(make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 12))[0])
+def flight(tree):
+    return read_track(find_tracks(tree)[0])
 
 
 @pytest.fixture(scope="module")

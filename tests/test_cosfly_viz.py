@@ -191,11 +191,6 @@ def test_hostile_text_is_text(tab, page):
     assert tab.said == []
 
 
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory):
-    return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 10, with_augmented=False)
-
-
 # Views, layout, largest side: every count of views, orders that are not the usual one, both layouts and sizes.
 SHAPES = [
     (("rgb",), "separate", 640), (("depth", "rgb"), "tiled", 40), (("segmentation", "rgb", "depth"), "separate", 40),
