@@ -14,7 +14,7 @@ from benchmarks.census_town import CENSUS, census_town
 from shapely.geometry import Point, Polygon, box
 from tables import each
 
-from cosfly.formats.boxes import BoxMap
+from cosfly.formats.boxes import BoxMap, read_boxes
 from cosfly.formats.kinds import KINDS
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.footprints import united
@@ -363,6 +363,13 @@ def test_courtyards_stay_open(tmp_path: Path):
     court = Point(20 - boxes.header.offset_m["x"], 20 - boxes.header.offset_m["y"])
     assert union.distance(court) > 7  # 10 m, less what a fill of 0.9 may take
     assert 1319.9 < union.area < 1320 / 0.9
+
+
+def test_the_stage_writes_the_same_bytes_and_the_seed(tmp_path: Path):
+    one, two = (run(MapsConfig(), tmp_path / name, seed=5) for name in ("one", "two"))
+    for name in ("boxes_3d.json", "map.png"):
+        assert (one.parent / name).read_bytes() == (two.parent / name).read_bytes()
+    assert read_boxes(one).header.source.seed == 5
 
 
 def test_surfaces_of_a_town_do_not_share_a_plane():

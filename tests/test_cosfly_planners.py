@@ -248,6 +248,20 @@ def straight_scenario(obstacles, length_m=30.0):
     return make_scenario(walk_along("w", [(0, 0), (length_m, 0)]), obstacles, CFG)
 
 
+def test_the_reference_places_are_in_the_lattice_and_cost_nothing():
+    scenario, _ = scenario_of("corner")
+    for climbing in (False, True):
+        made = foresight.make_lattice(scenario, climbing=climbing)
+        requested = scenario.reference.places_m(scenario.targets_m, scenario.ground_m)[made.frames]
+        ring = foresight.RINGS.index((0, 0))
+        np.testing.assert_allclose(made.places_m[:, ring, 0], requested, atol=1e-9)
+        assert (made.costs[:, ring, 0] == 0).all()
+        assert (np.delete(made.costs.reshape(len(requested), -1), ring * foresight.NUM_AZIMUTHS, axis=1) > 0).all()
+        assert (made.frames[0], made.frames[-1]) == (0, len(scenario.targets_m) - 1)
+        away_m = np.hypot(*(made.places_m - scenario.targets_m[made.frames, None, None])[..., :2].T)
+        assert made.radius_max_m == pytest.approx(away_m.max())
+
+
 def cheapest_by_trying_all(places, own, longest_m, index, clearance_m, links, num_azimuths, max_turn, way_cost):
     """The least cost of any sequence of places, each step asked of the kernels."""
     free = kernels.signed_distances(index, places.reshape(-1, 3), 50.0)[0].reshape(own.shape) >= clearance_m
