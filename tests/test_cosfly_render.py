@@ -484,6 +484,8 @@ def test_what_a_wall_hides_is_not_said(y_m, says_legs):
 @pytest.fixture(scope="session")
 def crowded_tree(built_once):
     """Two walks, both tracks, each among eight bystanders of whom four look alike the target but for one thing."""
+    if NO_GL:
+        pytest.skip(NO_GL)
     return built_once("crowd", make_crowded_tree) / "out"
 
 

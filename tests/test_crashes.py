@@ -1,19 +1,39 @@
-"""kill -9 at every point of commands that write; all of them: `python tests/crash_sweep.py`."""
+"""The whole way on a tiny town: every stage, one and two workers; kill -9 at every point of commands that write, all of them
+by `python tests/crash_sweep.py`.
+"""
 
+import contextlib
+import itertools
+import re
+import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from commands import working_here
 from crash_sweep import COMMANDS
 from crashes import called_complete, sweep
+from specimens_release import SMALL_RUN
 from toy_workers import stage_in
 from typer.main import get_command
+from typer.testing import CliRunner
 
 from cosfly.cli import app
+from cosfly.formats.captions import read_captions
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
+from cosfly.pipeline import run as pipeline
+from cosfly.pipeline import runs
+from cosfly.pipeline.runs import estimate
+from cosfly.pipeline.settings import RunConfig
+from cosfly.runtime.config import load
+from cosfly.runtime.errors import ConfigError, EnvironmentMissing, ResumeError, VerifyError
 from cosfly.runtime.io import atomic_folder, write_bytes
-from cosfly.runtime.json_io import write_json
-from cosfly.runtime.run_dir import Tally
+from cosfly.runtime.json_io import read_json, write_json
+from cosfly.runtime.run_dir import Tally, read_failures
+from release.verify.verify import verify
 
 SWEEP = Path(__file__).with_name("crash_sweep.py")
 # Of the commands that need a finished run, those that are swept here.
@@ -89,3 +109,287 @@ def test_every_command_that_writes_is_in_the_sweep():
     swept = [text for commands in COMMANDS.values() for text in commands if isinstance(text, str)]
     lacking = {name for name in names if not any(line.startswith(f"{name} ") for line in swept)}
     assert lacking == told | {"bench"}
+
+
+STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")
+
+
+def tiny(**changes) -> RunConfig:
+    return load(RunConfig, None, [*SMALL_RUN, *(f"{key}={value}" for key, value in changes.items())])
+
+
+def products(folder: Path) -> dict[str, str]:
+    """Product -> sha256 of a complete stage. Frames stand for themselves by their flight's checksum file."""
+    return {entry["path"]: entry["sha256"] for entry in read_json(folder / "manifest.json")["outputs"]}
+
+
+def begin(small_run: Path, out: Path, stage: str) -> Path:
+    for name in STAGES[: STAGES.index(stage)]:
+        shutil.copytree(small_run / name, out / name)
+    shutil.copy(small_run / "run.yaml", out)
+    return out
+
+
+def work(cfg: RunConfig, out: Path, stage: str) -> None:
+    next(s for s in pipeline.stages(cfg, out) if s.name == stage).work()
+
+
+@pytest.mark.slow
+def test_the_licence_of_the_map_reaches_the_card(small_run):
+    card = (small_run / "release/dataset/README.md").read_text(encoding="utf-8")
+    assert "license: apache-2.0\n" in card
+    assert "Map of Town_SynthTown: SynthTown, licence apache-2.0." in card
+
+
+def test_every_stage_is_complete_and_adds_up(small_run):
+    for stage in STAGES:
+        manifest = read_json(small_run / stage / "manifest.json")
+        counts = manifest["counts"]
+        assert counts["kept"] + sum(counts["dropped"].values()) + sum(counts["failed"].values()) == counts["input"], (
+            stage
+        )
+        assert products(small_run / stage), stage
+    assert read_json(small_run / "summary.json")["peak_memory_mb"] > 10
+    for picture in ("contact_sheet.png", "viewer.html"):
+        assert (small_run / picture).stat().st_size > 10_000
+
+
+def test_a_run_goes_on_by_its_folder_or_its_settings_whatever_is_begun(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(pipeline, "run", lambda cfg, out, **_: asked.append(out) or [])
+    monkeypatch.setattr("cosfly.cli.run.print_run", lambda out: None)
+    for number, (config, begun) in enumerate(
+        [("", ""), ("", "one/maps"), ("run.yaml", "one/maps"), ("run.yaml", "maps")]
+    ):
+        run = tmp_path / str(number)
+        write_json(run / begun / "stage.json", {}) if begun else run.mkdir()
+        (run / "run.yaml").write_text("towns: {one: {}, two: {}}\n" if begun != "maps" else "seed: 2\n")
+        assert CliRunner().invoke(app, ["run", str(run / config)]).exit_code == 0
+        assert CliRunner().invoke(app, ["run", str(run / config), "--out", str(tmp_path / "new")]).exit_code == 0
+        assert asked[-2:] == [run, tmp_path / "new"]
+
+
+def test_a_dry_run_writes_nothing(small_run):
+    beside = small_run.parent / "other"
+    rows = {row.name: row for row in estimate(tiny(), beside)}
+    frames = sum(flight["num_frames"] for flight in read_json(small_run / "render/manifest.json")["flights"])
+    assert (rows["render"].count, rows["release"].count) == (frames, frames)
+    for name in ("render", "release"):
+        found = sum(path.stat().st_size for path in (small_run / name).rglob("*") if path.is_file())
+        assert rows[name].bytes == pytest.approx(found, rel=0.2)
+    shown = CliRunner().invoke(app, ["run", str(small_run), "--out", str(beside), "--dry-run"])
+    assert shown.exit_code == 0, shown.output
+    assert "total: about" in shown.output
+    assert not beside.exists()
+
+
+def test_a_release_of_the_papers_shape_is_estimated(monkeypatch, tmp_path):
+    """250 trajectories of 618 to 770 frames, 400 of each: 100,000 frames a track."""
+    sample = runs.RunSample([618 + i % 153 for i in range(250)], 4e6)
+    monkeypatch.setattr(runs, "take_sample", lambda cfg, out: sample)
+    release = estimate(tiny(), tmp_path)[-1]
+    assert (release.name, release.count, release.bytes) == ("release", 200_000, 200_000 * 4e6)
+    clean = estimate(tiny(**{"render.tracks": ["clean"], "release.tracks": ["clean"]}), tmp_path)[-1]
+    assert clean.count == 100_000
+
+
+def test_a_finished_run_costs_nothing_more_and_a_half_finished_one_the_rest(small_run, tmp_path):
+    assert all(row.is_done and row.seconds == 0 for row in estimate(tiny(), small_run))
+    half = begin(small_run, tmp_path / "run", "inspect")
+    rows = estimate(tiny(), half)
+    assert [row.name for row in rows if not row.is_done] == ["inspect", "caption", "release"]
+    exact = sum(flight["num_frames"] for flight in read_json(small_run / "render/manifest.json")["flights"])
+    assert rows[-1].count == exact
+
+
+def test_a_dry_run_reuses_a_plan_and_plans_a_sample_only(small_run, tmp_path, monkeypatch):
+    frames = sum(flight["num_frames"] for flight in read_json(small_run / "render/manifest.json")["flights"])
+    monkeypatch.setattr(runs, "SAMPLED_TRAJECTORIES", 1)
+    sample = runs.take_sample(tiny(), tmp_path / "new")
+    assert len(sample.frames) == 1
+    assert sample.scale > 1
+    assert 2 * sample.total(sample.frames) == frames
+    monkeypatch.setattr(runs, "plan_trajectories", None)
+    planned = begin(small_run, tmp_path / "run", "render")
+    before = sorted(planned.rglob("*"))
+    sample = runs.take_sample(tiny(), planned)
+    assert (2 * sum(sample.frames), sample.scale, sample.frame_bytes is None) == (frames, 1.0, False)
+    with pytest.raises(ResumeError, match=r"run/pedestrians: .*num_paths was 2, is 3"):
+        estimate(tiny(**{"pedestrians.num_paths": 3}), planned)
+    assert sorted(planned.rglob("*")) == before
+
+
+def test_a_dry_run_without_a_map_names_the_simulator_and_the_way_out(tmp_path):
+    with pytest.raises(EnvironmentMissing, match=r"no UnrealCV server answers.*has finished the stage maps"):
+        estimate(tiny(**{"maps.source": "unrealcv", "maps.unrealcv.port": 9}), tmp_path)
+
+
+def test_two_walks_give_two_flights_on_two_tracks_with_captions(small_run):
+    flights = [read_track(folder) for folder in find_tracks(small_run / "render")]
+    assert sorted(flight.variant for flight in flights) == ["ORI", "ORI", "aug_001", "aug_001"]
+    assert all(flight.missing_frames() == [] for flight in flights)
+    captions = list(read_captions(small_run / "caption/captions.jsonl"))
+    accepted = [c for c in captions if c.status == "accepted"]
+    assert len(accepted) > 10
+    assert all(c.en and c.zh and c.en.flight_decision == c.zh.flight_decision for c in accepted)
+    assert [c.sample_id for c in captions] == sorted(c.sample_id for c in captions)
+
+
+def test_every_file_of_a_run_stands_in_the_files_page(small_run):
+    page = (Path(__file__).parents[1] / "docs/files.md").read_text(encoding="utf-8")
+    names = {path.name for path in small_run.rglob("*") if path.is_file()}
+    assert len(names) > 30
+    assert sorted(name for name in names if name not in page and not name.endswith(".parquet")) == []
+
+
+def test_running_again_changes_nothing(small_run):
+    before = {
+        p: p.stat().st_mtime_ns
+        for p in small_run.rglob("*")
+        if p.is_file() and p.name not in ("run.yaml", "summary.json")
+    }
+    results = pipeline.run(tiny(), small_run)
+    assert all(result.was_complete for result in results)
+    assert {p: p.stat().st_mtime_ns for p in before} == before
+
+
+def test_other_settings_are_refused_by_name_and_nothing_is_touched(small_run, tmp_path, caplog):
+    out = begin(small_run, tmp_path / "run", "plan")
+    before = (out / "run.yaml").read_bytes()
+    caplog.set_level("INFO")
+    with pytest.raises(ResumeError, match=r"num_paths was 2, is 1"):
+        pipeline.run(tiny(**{"pedestrians.num_paths": 1}), out)
+    assert (out / "run.yaml").read_bytes() == before
+    assert "pedestrians: already complete" not in caplog.text
+    assert not (out / ".lock").exists(), "who failed holds nobody up"
+
+
+# Made for people, or the record of another file: nothing reads them as a product.
+UNBOUND = {
+    "run.yaml", "summary.json", "contact_sheet.png", "viewer.html", "stage.json", "manifest.json", "items.jsonl",
+    "failures.jsonl", "events.jsonl",
+}  # fmt: skip
+CHANGES = {
+    "edited": lambda data, other: data[:-2] + bytes([data[-2] ^ 1]) + data[-1:],
+    "cut": lambda data, other: data[: len(data) // 2],
+    "emptied": lambda data, other: b"",
+    "exchanged": lambda data, other: other,
+}
+# Which stages refuse a changed file when they begin. Those that are missing here read pictures: of them below.
+PICTURES = ("rgb.png", "depth_float32.png", "instance.png")
+REFUSED_BY = {
+    "maps/boxes_Nd.json": ("simplify", "render"),
+    "simplify/stepN_simplified.json": ("pedestrians", "plan", "render", "inspect"), "pedestrians/path.json": ("plan",),
+    "plan/drone_trace.json": ("render", "inspect"), "render/Town_SynthTown/instance_ids.json": ("caption", "release"),
+    "render/Town_SynthTown/map.json": ("caption", "release"),
+    "render/Town_SynthTown/trajectory_N/ORI/trajectory.json": ("caption", "release"),
+    "render/Town_SynthTown/trajectory_N/aug_N/trajectory.json": ("caption", "release"),
+    "render/Town_SynthTown/trajectory_N/ORI/checksums.shaN": ("caption", "release"),
+    "render/Town_SynthTown/trajectory_N/aug_N/checksums.shaN": ("caption", "release"),
+    "inspect/inspect.json": ("release",), "caption/captions.jsonl": ("release",),
+}  # fmt: skip
+
+
+def kinds_of(out: Path) -> dict[str, list[Path]]:
+    kinds: dict[str, list[Path]] = {}
+    for path in sorted(p for p in out.rglob("*") if p.is_file() and p.name not in UNBOUND):
+        kinds.setdefault(re.sub(r"\d+", "N", path.relative_to(out).as_posix()), []).append(path)
+    return kinds
+
+
+@contextlib.contextmanager
+def changed(paths: list[Path], change: str) -> Iterator[Path]:
+    """Change the first file of a kind, exchange it for the second or for what another run has, and put it back."""
+    data = paths[0].read_bytes()
+    other = paths[1].read_bytes() if len(paths) > 1 else b"of another run"
+    paths[0].write_bytes(CHANGES[change](data, data + b" " if other == data else other))
+    try:
+        yield paths[0]
+    finally:
+        paths[0].write_bytes(data)
+
+
+def test_a_changed_file_is_refused_by_the_stages_that_read_it(small_run, tmp_path_factory):
+    tampered = shutil.copytree(small_run, tmp_path_factory.mktemp("tampered") / "run")
+    kinds = kinds_of(tampered)
+    cases = [(kind, stage) for kind, stages in REFUSED_BY.items() for stage in stages]
+    for (kind, stage), change in zip(cases, itertools.cycle(CHANGES)):
+        with changed(kinds[kind], change) as path, pytest.raises(VerifyError, match=re.escape(path.name)):
+            work(tiny(), tampered, stage)
+
+
+@pytest.mark.slow
+def test_no_changed_picture_reaches_a_release(small_run, tmp_path):
+    out = begin(small_run, tmp_path / "run", "release")
+    flights = find_tracks(out / "render")
+    for flight, name in zip(flights[:3], PICTURES, strict=True):
+        frames = flight / "frames_playback"
+        shutil.copy(frames / "frame_00001" / name, frames / "frame_00000" / name)
+    with pytest.raises(VerifyError, match="nothing is released"):
+        work(tiny(), out, "release")
+    messages = [failure.message for failure in read_failures(out / "release/failures.jsonl")]
+    assert messages
+    for message in messages:  # each shard names its first problem
+        assert "differs from the recorded digest" in message
+        assert any(f"frame_00000/{name}: the file" in message for name in PICTURES)
+    assert not (out / "release/dataset").exists()
+    assert not (out / "release/manifest.json").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["pedestrians", "plan", "render", "inspect", "caption", "release"])
+def test_two_workers_give_the_same_products(small_run, tmp_path, stage):
+    out = begin(small_run, tmp_path / "run", stage)
+    work(tiny(workers=2), out, stage)
+    assert products(out / stage) == products(small_run / stage)
+
+
+OF_TOWNS = (
+    "render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]", "inspect.legible_min=0",
+    "caption.window.stride=4",
+)  # fmt: skip
+TOWNS = """
+towns={
+  one: {maps: {synthetic: {size_m: 150, num_blocks: 1}}},
+  two: {maps: {synthetic: {size_m: 160, num_blocks: 1, preset: village}}, pedestrians: {num_paths: 1}},
+}"""
+
+
+@pytest.fixture(scope="module")
+def towns(tmp_path_factory):
+    out = tmp_path_factory.mktemp("towns") / "run"
+    with working_here():
+        pipeline.run(load(RunConfig, None, [*SMALL_RUN, *OF_TOWNS, TOWNS.strip()]), out)
+    return out
+
+
+@pytest.mark.slow
+def test_several_towns_are_runs_of_their_own_and_one_release(towns):
+    assert sorted(path.name for path in towns.iterdir()) == ["one", "release", "run.yaml", "summary.json", "two"]
+    for town, paths in (("one", 2), ("two", 1)):
+        assert read_json(towns / town / "pedestrians/manifest.json")["counts"]["input"] == paths
+        assert not (towns / town / "release").exists()
+        assert (towns / town / "contact_sheet.png").exists()
+    numbers = read_json(towns / "release/dataset/release.json")["numbers"]
+    assert set(numbers["counts"]["town"]) == {"Town_one", "Town_two"}
+    assert verify(towns / "release/dataset").is_ok
+    stages = [row["stage"] for row in read_json(towns / "summary.json")["stages"]]
+    assert stages == [*(f"one/{name}" for name in STAGES[:-1]), *(f"two/{name}" for name in STAGES[:-1]), "release"]
+
+
+@pytest.mark.slow
+def test_the_stages_one_by_one_make_a_town_as_the_run_does(towns, tmp_path, in_this_process):
+    made = [tmp_path / "maps/boxes_3d.json", tmp_path / "simplify/step2_simplified.json"]
+    made += [tmp_path / "pedestrians/path.json", tmp_path / "plan/drone_trace.json"]
+    inputs = ([], ["--map", made[0]], ["--map", made[1]], ["--map", made[1], "--paths", made[2]])
+    for product, needed in zip(made, inputs, strict=True):
+        command = [product.parent.name, *needed, "--config", towns / "run.yaml", "--town", "one"]
+        done = CliRunner().invoke(app, [*map(str, command), "--out", str(product.parent)])
+        assert done.exit_code == 0
+        assert "--town" not in done.output
+        assert product.read_bytes() == (towns / "one" / product.relative_to(tmp_path)).read_bytes()
+    nobody = ["maps", "--config", str(towns / "run.yaml"), "--out", str(tmp_path / "none")]
+    told = " ".join(CliRunner().invoke(app, nobody).output.split())
+    assert "no --town is given, so the settings that the towns one, two share are used" in told
+    with pytest.raises(ConfigError, match=r"--town: .*no town of this name .did you mean 'one'.*got oen; expected"):
+        CliRunner().invoke(app, [*nobody, "--town", "oen"], catch_exceptions=False)

@@ -1,33 +1,64 @@
-"""Files of strangers, one property for each reader: whatever the bytes, it reads them or says why not in one line."""
+"""Foreign files and texts: whatever the bytes, a reader reads them or says why not in one line; the terminal obeys no
+text, pages and cards show it as it is, and no length of it is too long.
+"""
 
+import base64
+import copy
+import io
 import json
 import random
 import re
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
+from browser import browser
+from commands import invoke
+from hypothesis import given
+from hypothesis import strategies as st
+from markdown_it import MarkdownIt
+from pydantic import BaseModel, ValidationError
+from rich.table import Table
 from specimens_release import build, make_inputs
 from test_cosfly_answers import TEXT
+from test_cosfly_inspection import plan_of
 
+from caption.schema import CaptionConfig
+from caption.stage.ledger import page_html
+from caption.stage.stage import run as caption
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
-from cosfly.formats.captions import read_captions
+from cosfly.formats.captions import Caption, read_captions
 from cosfly.formats.frames import DEPTH_PNG, read_depth, read_instance, read_meta, read_rgb
+from cosfly.formats.inspection import Inspection, read_inspection
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback import read_track
 from cosfly.formats.roi import read_roi
+from cosfly.formats.traces import write_traces
+from cosfly.formats.tracks import find_tracks
+from cosfly.geometry.axes import box_corners
+from cosfly.inspection.report import report_html
+from cosfly.inspection.stage import run as inspect
 from cosfly.llm.answer_text import parse_answer
+from cosfly.llm.answers import BudgetConfig
+from cosfly.llm.protocol import check_url
 from cosfly.maps import boxfile, cityjson, simworld
-from cosfly.runtime.errors import CosflyError
+from cosfly.runtime import console as shared
+from cosfly.runtime.errors import ConfigError, CosflyError, InputError
+from cosfly.runtime.escaping import LONGEST, for_terminal
 from cosfly.runtime.io import CHECKSUMS, read_checksums
-from cosfly.runtime.json_io import write_json
+from cosfly.runtime.json_io import read_json, write_json
 from cosfly.runtime.run_dir import read_manifest
 from cosfly.runtime.tables import rows_of
-from release.record import read_record
-from specimens import pack_depth
+from cosfly.viz.scene_page import run
+from release.card.render import render_card
+from release.record import ReleaseRecord, read_record
+from specimens import make_playback_tree, pack_depth
 
 INPUTS = 40  # for each reader
 LONGEST_LINE = 5_000
@@ -188,3 +219,266 @@ def test_a_reader_takes_any_bytes_or_refuses_them_in_one_line(specimens, name):
     assert lines or name == "answer"
     assert max(map(len, lines), default=0) < LONGEST_LINE
     assert [line for line in lines if re.search(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\u202e]", line)] == []
+
+
+OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")  # by a terminal
+HOSTILE = (
+    "\x1b]0;owned\x07\x1b[31m\u202e</p><script>alert(1)</script><img src=x onerror='alert(2)'>`|[a](javascript:b)[/]"
+)
+
+
+@given(st.text(alphabet=st.characters(codec=None), max_size=200))
+def test_a_terminal_is_given_nothing_that_it_obeys(text):
+    assert not OBEYED.search(for_terminal(text))
+    for_terminal(text).encode("utf-8")  # half of a surrogate pair would stop the stream
+
+
+def printed(monkeypatch, *, is_terminal: bool = True, width: int = 400) -> io.StringIO:
+    stream = io.StringIO()
+    terminal = type(shared.console)(stderr=True)
+    terminal.file, terminal._force_terminal, terminal.width, terminal.no_color = stream, is_terminal, width, True
+    monkeypatch.setattr(shared, "console", terminal)
+    return stream
+
+
+def test_lines_and_cells_are_printed_and_not_obeyed(monkeypatch):
+    stream = printed(monkeypatch)
+    table = Table(title=HOSTILE)
+    table.add_column(HOSTILE)
+    table.add_row(HOSTILE)
+    shared.console.print(HOSTILE)
+    shared.console.print(table)
+    lines = stream.getvalue()
+    assert "\x1b]0" not in lines
+    assert "\x07" not in lines
+    assert "\u202e" not in lines
+    assert lines.count("\\x1b]0;owned\\x07") == 4
+    assert lines.count("[/]") == 4  # and no MarkupError
+
+
+def test_an_error_is_one_short_line_whatever_it_names():
+    error = InputError("not a number", where=Path(HOSTILE), got=HOSTILE + "9" * 5_000_000, expected="one\nline")
+    assert len(str(error)) < 5 * LONGEST
+    assert not OBEYED.search(str(error))
+    assert "\n" not in str(error)
+
+
+def test_a_key_in_an_address_is_never_shown():
+    for address in (
+        "http://user:SECRET99@host/v1", "user:SECRET99@host", "https://user%3ASECRET99%40host/v1",
+        "http://host/v1?api_key=SECRET99", "http://host/v1;key=SECRET99", "http://host/v1&key=SECRET99",
+        "http://host/v1#access_token=SECRET99", "http://host/v1%3Fkey%3DSECRET99", "http://host/sk-SECRET99/v1",
+        "http://host/v1/token/SECRET99", "http://host/hf_SECRET99/v1", "s3://host/x?X-Amz-Signature=SECRET99",
+        "http://host/api-key-SECRET99/v1", "wss://user:SECRET99@host",
+    ):  # fmt: skip
+        shown = str(ConfigError("no answer", where=address, got=f"see '{address}' again", fix=f"try {address}"))
+        assert "SECRET99" not in shown
+        assert shown.count("***") == 3
+        with pytest.raises(ValueError, match="must not contain a user") as refused:
+            check_url(address)
+        assert "SECRET99" not in str(refused.value)
+    for address in ("http://host:SECRET99/v1", "ftp://host/SECRET99", "SECRET99", "Bearer SECRET99"):
+        with pytest.raises(ValueError, match="must start with http") as refused:
+            check_url(address)
+        assert "SECRET99" not in str(refused.value)
+    for text in ("https://host.org:8000/openai/deployments/gpt-4o-mini/v1", "expected key=value", "10:30 at Delft"):
+        assert for_terminal(text) == text
+
+
+class Tags(HTMLParser):
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.seen: set[tuple[str, ...]] = set()
+        self.links: list[str] = []
+        self.policy = ""
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.seen.add((tag, *sorted(name for name, _ in attrs)))
+        self.links += [value or "" for name, value in attrs if name in ("src", "href")]
+        if ("http-equiv", "Content-Security-Policy") in attrs:
+            self.policy = dict(attrs)["content"] or ""
+
+    handle_startendtag = handle_starttag
+
+
+def texts_in(value: Any, path: tuple = ()) -> Iterator[tuple]:
+    """Yield where texts stand in JSON."""
+    if isinstance(value, str):
+        yield path
+    elif isinstance(value, dict | list):
+        for key in value if isinstance(value, dict) else range(len(value)):
+            yield from texts_in(value[key], (*path, key))
+
+
+def forged(model: type[BaseModel], honest: BaseModel, least: int) -> BaseModel:
+    value = honest.model_dump(mode="json")
+    count = 0
+    for path in list(texts_in(value)):
+        other = copy.deepcopy(value)
+        place = other
+        for key in path[:-1]:
+            place = place[key]
+        place[path[-1]] = HOSTILE
+        try:
+            model.model_validate(other)
+        except ValidationError:
+            continue  # one of a closed set
+        value, count = other, count + 1
+    assert count >= least
+    return model.model_validate(value)
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory) -> Path:
+    return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 12, width_px=64, height_px=36)
+
+
+@pytest.fixture(scope="module")
+def inspection(tree, tmp_path_factory) -> Path:
+    from cosfly.inspection.settings import InspectConfig
+
+    return inspect(InspectConfig(jerk_rms_max_mps3=1e6), None, None, tree, tmp_path_factory.mktemp("inspected"))
+
+
+def check_page(page: str, honest: str) -> None:
+    """Same tags as in the honest page, none of them the forger's; and a policy that would stop them."""
+    found = Tags(page)
+    assert found.seen <= Tags(honest).seen | {("ul", "class"), ("li", "class"), ("td", "colspan"), ("tr", "class")}
+    assert "script" not in {tag for tag, *_ in found.seen}
+    assert all(link.startswith("data:image/jpeg;base64,") for link in found.links)
+    assert "default-src 'none'" in found.policy
+    assert "script-src" not in found.policy
+    assert HOSTILE[:8] not in page
+    assert "&lt;script&gt;" in page  # shown, not left out
+
+
+def test_the_page_of_an_inspection_shows_forged_records(inspection):
+    honest = read_inspection(inspection)
+    false = forged(Inspection, honest, 8)
+    check_page(report_html(HOSTILE, false, {}), (inspection.parent / "report.html").read_text(encoding="utf-8"))
+
+
+def test_the_page_of_a_captioning_run_shows_forged_captions(tree, tmp_path):
+    done = caption(CaptionConfig(), tree, tmp_path / "caption").parent
+    from caption.stage.ledger import CaptionReport
+
+    value = read_json(done / "caption_report.json")
+    report = CaptionReport.model_validate({k: v for k, v in value.items() if k not in ("schema", "schema_version")})
+    cards = [forged(Caption, card, 8) for card in list(read_captions(done / "captions.jsonl"))[:3]]
+    page = page_html(forged(CaptionReport, report, 1), cards, {}, BudgetConfig(), HOSTILE)
+    check_page(page, (done / "report.html").read_text(encoding="utf-8") + '<div class="gone"></div>')
+
+
+markdown = MarkdownIt("commonmark", {"html": True}).enable("table")
+
+
+def test_a_card_shows_forged_texts(tree, inspection, tmp_path):
+    from release.build.config import ReleaseConfig
+    from release.build.sources import Source
+    from release.build.stage import run
+
+    captions = caption(CaptionConfig(), tree, tmp_path / "caption")
+    folder = run(
+        ReleaseConfig(licence="mit", pairs="any"), [Source.of_files(tree, captions, inspection)], tmp_path / "release"
+    )
+    folder = folder if folder.is_dir() else folder.parent
+    value = read_json(folder / "release.json")
+    record = ReleaseRecord.model_validate({k: v for k, v in value.items() if k not in ("schema", "schema_version")})
+    card = render_card(forged(ReleaseRecord, record, 8))
+    page = markdown.render(card.split("\n---\n", 1)[1])
+    assert "alert(1)" in page
+    assert not {"script", "img", "a"} & {tag for tag, *_ in Tags(page).seen}
+    assert not OBEYED.search(card.replace("\n", ""))
+
+
+EVIL = "</script><script>window.hacked=1</script><img src=x onerror='window.hacked=2'>"
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    """A map of three boxes with a hostile name, a tree of two walks, and what two planners flew over them."""
+    root = tmp_path_factory.mktemp("scene")
+    tree = make_playback_tree(root / "tree", 2, 8, width_px=96, height_px=54)
+    rows, halves = [[0, 0, -0.1], [6, 3, 5], [30, 4, 2]], [[60, 60, 0.1], [2, 3, 5], [1, 1, 2]]
+    kinds = [KINDS[kind] for kind in ("Ground", "Buildings", "Vegetation")]
+    header = MapHeader(name=EVIL, ground_z_m=0.0)
+    write_boxes(
+        root / "map.json", make_box_map(rows, halves, [[0, 0, 0], [10, 40, 5], [0, 0, 0]], kinds, header=header)
+    )
+    flights = [read_track(folder) for folder in find_tracks(tree) if folder.name == "ORI"]
+    plans = [plan_of(flight.folder) for flight in flights]
+    for name in ("muco", EVIL):
+        own = [replace(plan, planner=name, metrics={"length_m": 12.5}) for plan in plans]
+        write_traces(root / f"drone_trace_{len(name)}.json", own, {})
+    return root
+
+
+def planners(place: Path) -> list[Path]:
+    return sorted(place.glob("drone_trace_*.json"))
+
+
+def data_of(page: Path) -> dict:
+    return json.loads(re.search(r'id="data">(.*?)</script>', page.read_text(encoding="utf-8"), re.DOTALL)[1])
+
+
+def floats(text: str, width: int) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, width)
+
+
+def test_what_is_packed_is_what_was_read(place, tmp_path):
+    page = run(place / "map.json", tmp_path / "scene.html", traces=planners(place), data=place / "tree")
+    data = data_of(page)
+    rows = floats(data["boxes"], 12)
+    assert [(kind["name"], kind["first"], kind["count"]) for kind in data["kinds"]] == [
+        ("Ground", 0, 1), ("Buildings", 1, 1), ("Vegetation", 2, 1),
+    ]  # fmt: skip
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    found = rows[2, :3] + signs @ rows[2, 3:].reshape(3, 3)
+    assert np.allclose(found, box_corners(np.array([30, 4, 2]), np.array([1, 1, 2])), atol=1e-4)
+    turned = rows[1, 3:].reshape(3, 3)
+    assert np.allclose(np.linalg.norm(turned, axis=1), [2, 3, 5], atol=1e-4)
+    assert np.allclose(turned @ turned.T, np.diag([4, 9, 25]), atol=1e-3)
+    flight = read_track(next(folder for folder in find_tracks(place / "tree") if folder.name == "ORI"))
+    number = next(k for k, track in enumerate(data["tracks"]) if track["kind"] == "clean frames")
+    assert np.allclose(floats(data["tracks"][number]["rows"], 10)[:, 1:4], flight.positions_m, atol=1e-3)
+    assert len(data["tracks"][number]["pictures"]) == len(flight)
+    assert len({track["kind"] for track in data["tracks"]}) == 4
+
+
+@pytest.mark.slow
+def test_the_page_works_offline_in_a_browser(place, tmp_path):
+    out, files = tmp_path / "scene.html", " ".join(f"--traces {path}" for path in planners(place))
+    done = invoke(f"view {place / 'map.json'} --out {out} --data {place / 'tree'} {files}")
+    assert done.exit_code == 0, done.output
+    with browser(tmp_path / "profile") as page:
+        page.open(out)
+        page.wait("document.body.dataset.ready === 'yes' && document.body.dataset.matrix === 'yes'")
+        drawn = lambda: page.run(  # noqa: E731  # how many pixels boxes cover
+            "(() => { const { space } = window.scene, gl = space.gl, { width, height } = space.canvas; space.paint(gl);"
+            "const all = new Uint8Array(4 * width * height);"
+            "gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, all);"
+            "let count = 0; for (let i = 3; i < all.length; i += 4) count += all[i] > 0; return count; })()"
+        )
+        before = drawn()
+        page.run("document.querySelector('#kinds input[type=checkbox]').click()")
+        assert 0 < drawn() < before / 2, "without its ground there is little left"
+        assert page.run("document.querySelectorAll('#frame img').length") == 2, "both tracks"
+        assert page.run("document.querySelectorAll('#compared th').length") == 3, "two planners"
+        assert "12.5" in page.run("document.getElementById('compared').textContent")
+        page.run("document.querySelector('#legend input').click()")
+        assert page.run("document.querySelectorAll('#compared th').length") == 2
+        page.press("ArrowRight")
+        page.press("ArrowRight")
+        assert page.run("document.getElementById('now').textContent") == "1.0 s"
+        assert "frame 2" in page.run("document.getElementById('frame').textContent")
+        page.press("ArrowDown")
+        assert page.run("document.querySelector('.line.here button').textContent") == data_of(out)["paths"][1]["name"]
+        page.run("document.querySelector('.line.here input').click()")
+        assert page.run("[...document.querySelectorAll('.line.here input')].some((one) => one.checked)") is False
+        page.press(" ")
+        page.wait("document.getElementById('time').value === document.getElementById('time').max")
+        page.wait("!window.scene.state.plays")
+        assert page.run("typeof window.hacked") == "undefined"
+        assert [said for said in page.said if '"warning"' not in said] == []
+        assert all(address.startswith(("file:", "data:")) for address in page.requests)
