@@ -14,13 +14,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from commands import invoke
 from pydantic import BaseModel
 from shapely.geometry import Polygon
 from specimens_png import png_around
 from tables import each
-from typer.testing import CliRunner
 
-from cosfly.cli import app
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.frames import depth_bytes, read_depth, rgb_bytes
 from cosfly.maps import cityjson
@@ -268,8 +267,8 @@ def test_one_command_follows_links_and_the_next_in_this_process_does_not(tmp_pat
     (picture,) = tree.rglob("frame_00001/rgb.png")
     picture.symlink_to(picture.rename(tmp_path / "rgb.png"))
     words = ["view", str(tree), "--out", str(tmp_path / "out.png")]
-    assert CliRunner().invoke(app, [*words, "--set", "follow_links=true"]).exit_code == 0
-    assert "leads out" in str(CliRunner().invoke(app, words).exception)
+    assert invoke(words, "--set follow_links=true").exit_code == 0
+    assert "leads out" in str(invoke(words).exception)
 
 
 def test_links_within_a_tree_and_to_a_tree_are_followed(tmp_path):

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import invoke
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_cosfly_inspection import CFG, plan_of, write_map
-from typer.testing import CliRunner
 
-from cosfly.cli import app
 from cosfly.formats.inspection import REVIEW, Choice, add_decisions, read_decisions, read_inspection, read_settled
 from cosfly.formats.traces import write_traces
 from cosfly.formats.tracks import find_tracks
@@ -94,7 +93,7 @@ def test_the_release_takes_what_was_accepted(product, inspected, monkeypatch):
 def test_the_command_decides_and_says_what_is_open(product):
     first, second, third, _ = folders_of(product)
     command = ["inspect", "review", "--inspect", str(product.parent)]
-    ask = lambda *words: CliRunner().invoke(app, [*command, *words])  # noqa: E731
+    ask = lambda *words: invoke([*command, *words])  # noqa: E731
     assert ask("--accept", first).exit_code == 2, "who, and why?"
     done = ask("--accept", first, "--accept", second, "--reject", third, "--by", "Bo", "--reason", "steady")
     assert done.exit_code == 0, done.output

@@ -4,14 +4,13 @@ import json
 
 import numpy as np
 import pytest
+from commands import invoke
 from specimens_planning import CANYON, town_of, walk_along
 from test_cosfly_render import needs_gl
 from test_render_camera import IN_THE_WALL
 from test_renderers_contract import circling, write_inputs
 from toy_workers import make_counting_worker, stage_in
-from typer.testing import CliRunner
 
-from cosfly.cli import app
 from cosfly.formats.boxes import write_boxes
 from cosfly.formats.pedestrian_paths import write_paths
 from cosfly.pipeline.bench import Bench, bench_run, run, tables, watchdog_figures
@@ -100,7 +99,7 @@ def test_the_target_grows_as_the_lens_does(tmp_path_factory, in_this_process):
     words = f"study zoom --map {boxes} --simplified {simplified} --traces {traces} --out {folder / 'out'} --every 2"
     settings = f"max_failed=1 render.fovs_deg={LEVELS} render.width_px=640 render.height_px=360".replace(", ", ",")
     sets = [word for setting in settings.split() for word in ("--set", setting)]
-    result = CliRunner().invoke(app, [*words.split(), "--workers", "0", *sets])
+    result = invoke(words, "--workers 0", sets)
     assert result.exit_code == 0, result.output
     out = folder / "out"
     found = json.loads((out / "zoom_study.json").read_text())
@@ -189,7 +188,7 @@ def test_what_cannot_be_measured(tmp_path):
         run(RunConfig(), tmp_path, tmp_path / "out", "render", [1])
     (tmp_path / "run.yaml").write_text("{}")
     for counts in ("two", "0,1", ""):
-        answer = CliRunner().invoke(app, ["bench", str(tmp_path), "--out", str(tmp_path / "o"), "--workers", counts])
+        answer = invoke("bench", tmp_path, "--out", tmp_path / "o", "--workers", [counts])
         assert answer.exit_code == 2
 
 

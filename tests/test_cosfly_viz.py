@@ -13,20 +13,19 @@ import cv2
 import numpy as np
 import pytest
 from browser import browser
+from commands import invoke
 from PIL import Image
 from specimens_captions import VOCABULARY
 from specimens_distill import WINDOW, make_caption
 from tables import each
 from test_cosfly_render import needs_gl
 from test_renderers_contract import circling, street, write_inputs
-from typer.testing import CliRunner
 
 from caption.schema import CaptionConfig, ImageConfig, Window, WindowConfig
 from caption.stage.window_loop import caption_window
 from caption.stage.windows import cut_windows
 from caption.teachers.prompts import make_question, question_messages
 from caption.teachers.teacher import RuleTeacher, encode_frame
-from cosfly.cli import app
 from cosfly.formats.boxes import make_box_map, write_boxes
 from cosfly.formats.captions import PICTURES_MARK, Language, write_captions
 from cosfly.formats.kinds import KINDS
@@ -318,7 +317,7 @@ def test_debug_pictures_are_written_where_they_are_asked_for(trees):
 
 @needs_gl
 def test_four_pictures_of_a_frame(trees, tmp_path):
-    result = CliRunner().invoke(app, ["view", str(trees[True]), "--frame", "best", "--out", str(tmp_path / "a.png")])
+    result = invoke("view", trees[True], "--frame best --out", tmp_path / "a.png")
     assert result.exit_code == 0, result.output
     assert Image.open(tmp_path / "a.png").size == (640, 2 * (180 + 36))
     name = four_panels(trees[False], tmp_path / "b.png", box_map=street())

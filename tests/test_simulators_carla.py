@@ -11,13 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import invoke
 from simulator_serving import AS_FOUND, as_client, carla_settings, command, free_port, serving
 from simulators.carla_server import depth_picture
 from simulators.scene import clothes_of
 from test_renderers_contract import circling, street, write_inputs
-from typer.testing import CliRunner
 
-from cosfly.cli import app
 from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.formats.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.formats.kinds import KINDS
@@ -54,7 +53,7 @@ def test_a_served_town_comes_back_as_it_is(tmp_path):
     town = invent(SyntheticConfig(), 3)
     with serving(town, tmp_path / "town") as port:
         words = ["maps", "--source", "carla", "--set", f"maps.carla.port={port}", "--out", str(tmp_path / "out")]
-        done = CliRunner().invoke(app, words, catch_exceptions=False)
+        done = invoke(words)
         wrong = CarlaMapConfig(port=port, town="Town99")
         with pytest.raises(
             ConfigError, match=rf"127\.0\.0\.1:{port} \(CARLA 0\.9\.16\).*no town of this name.*Town99.*{town.name}"

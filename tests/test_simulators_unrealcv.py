@@ -9,15 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import invoke
 from simulator_serving import free_port, serving
 from simulators import unrealcv_server
 from simulators.scene import clothes_of
 from simulators.unrealcv_server import UnrealCvServer
 from test_renderers_contract import street
 from test_simulators_carla import FRAMES, files_of, flown, same_but_for_pictures, schema_of
-from typer.testing import CliRunner
 
-from cosfly.cli import app
 from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.tracks import find_tracks
@@ -69,7 +68,7 @@ def test_a_served_town_comes_back_as_it_is(tmp_path):
     with serving(town, tmp_path / "town", protocol="unrealcv") as port:
         settings = f"maps.unrealcv={{port: {port}, most_default: 0.01}}"
         words = ["maps", "--source", "unrealcv", "--set", settings, "--out", str(tmp_path / "out")]
-        done = CliRunner().invoke(app, words, catch_exceptions=False)
+        done = invoke(words)
     assert done.exit_code == 0, done.output
     assert "using ip-port socket" not in done.output
     exported = read_boxes(tmp_path / "out/boxes_3d.json")
@@ -286,9 +285,9 @@ def test_the_papers_options(tmp_path):
             *("--map", str(boxes), "--simplified", str(simplified), "--traces", str(traces)),
             *("--out", str(tmp_path / "render"), "--set", "render.width_px=160", "--set", "render.height_px=90"),
         ]
-        done = CliRunner().invoke(app, words, catch_exceptions=False)
+        done = invoke(words)
     words[words.index("--path-index") + 1], words[words.index("--out") + 1] = "7", str(tmp_path / "other")
-    other = CliRunner().invoke(app, words)
+    other = invoke(words)
     assert done.exit_code == 0, done.output
     flights = find_tracks(tmp_path / "render")
     assert {json.loads((f / "trajectory.json").read_text())["source"]["path_index"] for f in flights} == {1}
