@@ -168,6 +168,7 @@ class ClosedLoopTrajectory:
         if problem := self.drone.problem_of(command):
             raise ValueError(problem)
         path_m, yaw_deg, pitch_deg = self._path(np.asarray(command, dtype=np.float64))
+        # Entry k is the clearance on the way from point k to point k + 1; the last one is that of the last point alone.
         gaps_m, _, _ = swept_distances(self.airspace.surroundings.obstacles, path_m, CLEARANCE_CAP_M)
         over_ground_m = path_m[:, 2] - self.airspace.ground.height_at(path_m)
         gaps_m = np.minimum(gaps_m[:-1], np.minimum(over_ground_m[:-1], over_ground_m[1:]))  # of each part of the path
@@ -178,7 +179,9 @@ class ClosedLoopTrajectory:
         self.index = i
         self.poses.positions_m[i] = path_m[end]
         self.poses.rotations_deg[i] = [pitch_deg, yaw_deg, 0.0]
-        self.poses.clearances_m[i - 1 : i + 1] = clearance_m
+        self.poses.clearances_m[i - 1 : i + 1] = (
+            clearance_m  # of the way from frame i - 1; a next step replaces that of i
+        )
         moment = self._drawn(i, self.velocity_mps.copy(), clearance_m)
         self._unseen_s = 0.0 if moment.target.visible else self._unseen_s + self.dt_s
         low, high = self.airspace.bounds_m

@@ -15,7 +15,7 @@ FAILED = "failed_"  # prefix of the reason of a failed prediction
 
 
 class Prediction(Record):
-    """One line of `predictions.jsonl`. `coc` is None where the answer has not the right structure, for the `reason`."""
+    """One line of `predictions.jsonl`. `coc` is None if the answer has a wrong structure, which `reason` names."""
 
     schema_version: Literal["1.0"] = "1.0"
     sample_id: str
@@ -29,7 +29,7 @@ class Prediction(Record):
     is_finished: bool  # False: cut at max_new_tokens, or where the context was full
     coc: Coc | None
     reason: str | None
-    recovered: list[str]
+    recovered: list[str]  # kinds of text around the object that were removed
 
     @property
     def key(self) -> str:

@@ -81,6 +81,9 @@ def fit_network(table: np.ndarray, labels: np.ndarray, rng: np.random.Generator)
     def scaled(rows: np.ndarray) -> np.ndarray:
         return np.clip((rows - center) / spread, -5.0, 5.0)
 
+    inputs = scaled(table)
+    is_label = np.eye(num_decisions)[labels]
+
     def apply(weights: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the hidden layer, the scores of the decisions, and the weights of the second layer."""
         parts = zip(np.split(weights, ends), shapes, strict=True)
@@ -92,14 +95,12 @@ def fit_network(table: np.ndarray, labels: np.ndarray, rng: np.random.Generator)
         """Return the cross entropy with the penalty, and its gradient."""
         hidden, scores, second = apply(weights, inputs)
         logs = scores - logsumexp(scores, axis=1, keepdims=True)
-        by_score = (np.exp(logs) - is_label) / len(inputs)
-        by_hidden = by_score @ second.T * (1.0 - hidden**2)
+        by_score = (np.exp(logs) - is_label) / len(inputs)  # softmax minus one-hot
+        by_hidden = by_score @ second.T * (1.0 - hidden**2)  # tanh' = 1 - tanh^2
         gradients = [inputs.T @ by_hidden, by_hidden.sum(axis=0), hidden.T @ by_score, by_score.sum(axis=0)]
         gradient = np.concatenate([part.ravel() for part in gradients]) + PENALTY * weights
         return float(-(logs * is_label).sum() / len(inputs) + PENALTY / 2 * weights @ weights), gradient
 
-    inputs = scaled(table)
-    is_label = np.eye(num_decisions)[labels]
     start = []
     for shape in shapes:
         values = rng.normal(size=shape) / math.sqrt(shape[0])
@@ -129,6 +130,7 @@ def fit_rule(table: np.ndarray, labels: np.ndarray, depth: int = 2) -> Rule:
         order = np.argsort(table[:, column])
         values = table[order, column]
         below = np.cumsum(is_label[order], axis=0)[:-1]
+        # The Gini impurity of both sides, weighted by size, is 1 - purity / len(labels).
         purity = (below**2 / sizes + (counts - below) ** 2 / (len(labels) - sizes)).sum(axis=1)
         purity[values[1:] == values[:-1]] = -1.0  # no threshold lies between equal values
         split = int(purity.argmax())

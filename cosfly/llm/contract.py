@@ -115,6 +115,7 @@ def run_until_interrupted(main: Coroutine[Any, Any, Result], *, keeps_work: bool
     if threading.current_thread() is not threading.main_thread():
         return asyncio.run(main)
     received: signal.Signals | None = None
+    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     async def guarded() -> Result:
         task = asyncio.current_task()
@@ -132,7 +133,6 @@ def run_until_interrupted(main: Coroutine[Any, Any, Result], *, keeps_work: bool
             asyncio.get_running_loop().add_signal_handler(number, interrupt, number)
         return await main
 
-    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         result = asyncio.run(guarded())
     except asyncio.CancelledError:
@@ -143,5 +143,5 @@ def run_until_interrupted(main: Coroutine[Any, Any, Result], *, keeps_work: bool
             signal.signal(number, handler)
     if received is None:
         return result
-    # Also one that came after the end of all tasks, while threads of the loop were waited for.
+    # A signal may also come after the end of all tasks, while the loop waits for its threads.
     raise KeyboardInterrupt if received == signal.SIGINT else SystemExit(128 + received)

@@ -171,6 +171,7 @@ def _draw_pedestrian(
     pace = PACES[draw_by_share(cfg.pace, rng)]
     route = take_pace(ground.grid.centers_of(cells), pace, rng)
     trip = Trip("Pedestrians", route, speeds_at(route, pace, cfg, rng) * rng.uniform(*OWN_SPEED))
+    # The head start is at most the time of the trajectory, so that this is more than enough.
     while trip.along_m(3.0 * target.time_s[-1:])[0] >= trip.route.along_m[-1]:
         trip = _with_return(trip)
     times_s = moment_s + np.arange(0.0, target.time_s[-1], target.time_s[1])

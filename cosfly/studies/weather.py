@@ -34,7 +34,7 @@ FIGURE_TILE_PX = (640, 360)  # width, height
 SHEET_TILE_PX = (320, 180)
 JPEG_QUALITY = 88
 FIGURE_NAME, SHEET_NAME = "weather_gallery.jpg", "weather_sheet.jpg"
-FOV_DEG = 67.38  # 90 degrees at a zoom of 1.5
+FOV_DEG = 67.38  # 90 degrees at a zoom of 1.5: 2 atan(tan(45 deg) / 1.5)
 
 
 def run(cfg: RenderConfig, boxes: Path, traces: Path, out: Path, *, seed: int = 0) -> tuple[Path, Path]:
