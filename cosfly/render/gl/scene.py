@@ -134,7 +134,7 @@ def _planes(
     axes[~is_house] = turns[~is_house]
     away = np.round(np.einsum("kj,kj->k", out, solids.corners_m.mean(axis=1)) / SAME_PLACE_M).astype(np.int64)
     level_z = np.round(solids.corners_m[..., 2].mean(axis=1) / SAME_PLACE_M).astype(np.int64)
-    # A part is told by direction, tilt and distance from the origin of a wall or slope, by the height of a flat roof;
+    # The key of a part: direction, tilt and distance from the origin of a wall or slope; the height of a flat roof;
     # any other thing is one part.
     key = np.stack([things, 1 + is_wall + 2 * is_flat, around, tilt, away], axis=1)
     key[is_flat, 2:4] = 0
