@@ -22,6 +22,7 @@ from caption.answer_formats.formats import THEREFORE, Draft
 from caption.schema import CaptionConfig, ObservedWindow, observed_frames
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.prompts import Question, make_question
+from caption.teachers.rule_decisions import decide
 from caption.teachers.students import student_settings
 from caption.teachers.teacher import first_budget, open_teacher
 from cosfly.closed_loop.settings import BASELINES, FlyConfig
@@ -175,6 +176,8 @@ class PromptedEngine:
         except (NoAnswer, CosflyError) as error:
             if isinstance(error, CosflyError) and error.fatal:
                 raise
+            if self._is_rules:  # a flight needs a decision, also where no fact supports one
+                return EngineDecision("ok", decide(question.facts), str(error)[:MOST_WORDS])
             return EngineDecision("none", words=str(error)[:MOST_WORDS])
         is_timed = not (self._is_rules or reply.is_kept)  # so that the records of rules are always the same
         answer_s = time.monotonic() - begun_s if is_timed else None
