@@ -202,6 +202,8 @@ def test_a_student_can_answer_with_its_decision_alone(town, tmp_path, in_this_pr
     assert chat_format.decision == "first"
     last = shutil.copytree(student, tmp_path / "last")
     write_chat_format(last, chat_format.model_copy(update={"decision": "last"}))
+    refused = attempt(town, tmp_path / "rules", f"{SHORT} {few} --student rules")
+    assert "works only with fly.student=transformers" in str(refused.exception)
     refused = attempt(town, tmp_path / "refused", f"{SHORT} {few} --student transformers:{last}")
     assert "writes its reasons before its decision" in str(refused.exception)
     texts = itertools.cycle(

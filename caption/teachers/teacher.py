@@ -60,7 +60,7 @@ class RuleTeacher:
             draws = random_bytes(self.seed, "caption", key)
             found[key] = write_templates(question.facts, draws, question.decision)
         if found[key] is None:
-            raise NoAnswer("no_reason", f"no observed fact supports {question.decision}", is_final=True)
+            raise NoAnswer("no_reason", f"no observed fact supports {question.decision or 'a decision'}", is_final=True)
         return found[key]  # type: ignore[no-any-return]
 
     async def ask(self, question: Question) -> Reply:

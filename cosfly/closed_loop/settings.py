@@ -127,6 +127,10 @@ class FlyConfig(Config):
             raise ValueError(
                 f"fly.adapter works only with fly.student=transformers:MODEL_DIR, but fly.student is {self.student!r}"
             )
+        if not self.reasons and self.engine != "transformers":
+            raise ValueError(
+                f"fly.reasons=false works only with fly.student=transformers:MODEL_DIR, not with {self.student!r}"
+            )
         return self
 
     def recorded(self) -> dict[str, Any]:
