@@ -15,6 +15,7 @@ from caption.verification.facts import Facts
 HORIZON_S = 2.5  # over which motion is extrapolated
 LEAST_TURN_DEG, LEAST_CLIMB_M, LEAST_ADVANCE_M = 3.0, 1.0, 1.0  # that call for a manoeuvre
 HINT = 0.5  # share of an expected manoeuvre that suggests it, where flying straight on is no answer
+ALMOST_STILL_MPS = 0.3  # a slower drone may hover
 SPEEDS = ("slow_down", "speed_up")  # which are not taken on a hint
 SHAKEN_M, SHAKEN_GAP_M = 0.4, 1.0  # a larger second difference of altitude, of distance: the track is perturbed
 
@@ -99,7 +100,9 @@ def ranked(f: Facts) -> list[str]:
     others = sorted((token for token in sizes if sizes[token] >= 1.0), key=sizes.__getitem__, reverse=True)
     is_hinted = not is_shaken(f)  # jitter is no hint
     hinted = [token for token in sizes if is_hinted and HINT <= sizes[token] < 1.0 and token not in SPEEDS]
-    return list(dict.fromkeys([first, *others, "track_straight", *sorted(hinted, key=sizes.__getitem__, reverse=True)]))
+    hinted.sort(key=sizes.__getitem__, reverse=True)
+    hovers = ["hover"] if f.mean_speed_mps < ALMOST_STILL_MPS else []
+    return list(dict.fromkeys([first, *others, "track_straight", *hovers, *hinted]))
 
 
 def _strongest(sizes: dict[str, float]) -> str:
