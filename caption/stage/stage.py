@@ -64,7 +64,7 @@ def run(
         TeacherError: The endpoint cannot be used, a budget is used up, or windows got no answer. Answers are kept.
     """
     if cfg.teacher_kind in EMBEDDED and retry_failed:
-        what, fix = "this teacher answers every window, so no window has to be retried", "remove --retry-failed"
+        what, fix = "this teacher asks no server, so no window has to be retried", "remove --retry-failed"
         raise ConfigError(what, where="--retry-failed", got=cfg.teacher_kind, fix=fix)
     vocabulary = vocabulary_of(cfg)
     cfg = student_settings(cfg, vocabulary)

@@ -21,7 +21,7 @@ from caption.verification.references import Fact, look_up, parse_reference
 from cosfly.formats.segments import MISSION_KINDS
 from cosfly.runtime.config import read_yaml
 
-MODEL = "rules-16"  # its name in the records; counts changes of decisions and wording
+MODEL = "rules-17"  # its name in the records; counts changes of decisions and wording
 Both = tuple[str, str]  # English, Chinese
 Condition = Callable[[Facts, int], bool]  # of the facts and the side of the decision: 1 left, -1 right, 0 neither
 
@@ -334,6 +334,7 @@ CONDITIONS: dict[str, Condition] = {
     "stands": stands,
     "lingers": lambda f, side: is_walk_known(f, side) and (f.target_speeds_mps[-1] or 0.0) < DAWDLING_MPS,
     "sets_off": sets_off, "turns": turns, "crosses": crosses, "comes": comes, "walks_away": walks_away, "walks": walks,
+    "slows_at_distance": says("trend:distance", "steady", slows), "hurries_at_distance": says("trend:distance", "steady", hurries),
     "slows": slows, "halts": lambda f, side: slows(f, side) and (f.target_speeds_mps[-1] or 0.0) < HALTED_MPS, "stops": lambda f, side: slows(f, side) and (f.target_speeds_mps[-1] or 0.0) < SLOW_MPS,
     "hurries": hurries, "off_centre": off_centre, "sight_turns": sight_turns, "swings_through_jitter": lambda f, side: is_shaken(f) and sight_turns(f, side),
     "crosses_sight": lambda f, side: crosses(f, side) and sight_turns(f, side),

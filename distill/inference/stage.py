@@ -174,7 +174,7 @@ def generate(
     import torch
     from transformers import GenerationConfig
 
-    core, end = student.core, student.end_token_id
+    core, end, pad = student.core, student.end_token_id, student.pad_token_id
     inputs = {name: torch.from_numpy(array).to(student.device) for name, array in prompt_batch(student, rows).items()}
     num_prompt = inputs["input_ids"].shape[1]
     # Under autocast keys and values may be of different types, which a static cache does not hold.
@@ -183,7 +183,7 @@ def generate(
         do_sample=False,
         max_new_tokens=max_tokens,
         eos_token_id=end,
-        pad_token_id=student.pad_token_id,
+        pad_token_id=pad,
         stop_strings=stop or None,
         cache_implementation="static" if is_one_type else "dynamic",
         disable_compile=True,  # a compiled step holds for one batch size and length, and costs a minute
@@ -194,7 +194,7 @@ def generate(
         found = core.generate(**inputs, **seen, tokenizer=student.tokenizer)
     completions = []
     for tokens in found[:, num_prompt:].tolist():
-        written = tokens[: tokens.index(end)] if end in tokens else tokens
+        written = tokens[: tokens.index(end)] if end in tokens else [token for token in tokens if token != pad]
         text = student.tokenizer.decode(written, skip_special_tokens=False).removeprefix(student.lead)
         text, stopped, _ = text.partition(stop) if stop else (text, "", "")
         completions.append(Completion(text, len(written), end in tokens or bool(stopped)))
