@@ -88,7 +88,10 @@ def test_path_and_trace_round_trip(tmp_path, subtests):
                     assert getattr(back, name) == value
             for change, words in (
                 (lambda record: record["t"].__setitem__(1, "x"), r"t"),
-                (lambda record: record["t"].__setitem__(1, record["t"][0]), r"t: the times do not increase; got 0, th"),
+                (
+                    lambda record: record["t"].__setitem__(1, record["t"][0]),
+                    r"t: the times do not increase; got 0 s, th",
+                ),
                 (lambda record: record.get("target", record)["y"].__setitem__(1, 1e9), r".*y: a place is too far from"),
             ):
                 write(path, [make()], {})

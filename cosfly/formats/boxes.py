@@ -210,7 +210,7 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
         ("extent", box_map.half_extents),
         ("rotation", box_map.rotations_deg),
     ):
-        what, expected = "the box has a number that is not finite or too large", f"at most {FARTHEST_M:,.0f}"
+        what, expected = "the box has a number that is not finite or too large", f"numbers up to {FARTHEST_M:,.0f}"
         check(name, rows, np.abs(rows) <= FARTHEST_M, what, expected)  # NaN fails
     half = box_map.half_extents
     check("extent", half, half >= 0, "the box has a negative extent", "half sizes of at least 0 m")
@@ -329,7 +329,7 @@ def read_boxes(path: Path) -> BoxMap:
         for name in UNIT_FIELDS & value.keys():
             if str(value[name]).lower() not in ("m", "metre", "metres", "meter", "meters", "none"):
                 raise InputError(
-                    "the map declares a unit or a coordinate system, which this format does not have",
+                    "the map declares another unit or coordinate system than that of boxes_3d.json",
                     where=f"{path}: {name}",
                     got=value[name],
                     expected=AXES,

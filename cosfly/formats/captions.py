@@ -110,9 +110,7 @@ BY_LETTERS = {token.replace("_", ""): token for token in TOKENS}  # tokens by th
 def not_in_set(token: object, where: object) -> InputError:
     """Return the error of a decision that is not in the set."""
     expected = f"one of {', '.join(TOKENS)}"
-    return InputError(
-        "the decision is not in the closed set of actions", where=str(where), got=str(token), expected=expected
-    )
+    return InputError("the decision is unknown", where=str(where), got=str(token), expected=expected)
 
 
 # --- captions.jsonl ---------------------------------------------------------------------------------------------------

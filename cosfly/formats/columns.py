@@ -97,7 +97,7 @@ def columns(record: dict, names: Iterable[str], where: str, length: int | None =
     for name in names:
         arrays.append(column(record, name, where, len(arrays[0]) if arrays else length))
         if name in XYZ and not (np.abs(arrays[-1]) <= FARTHEST_M).all():
-            got, expected = f"{np.abs(arrays[-1]).max():g}", f"at most {FARTHEST_M:,.0f} m"
+            got, expected = f"{np.abs(arrays[-1]).max():g} m", f"at most {FARTHEST_M:,.0f} m"
             raise InputError("a place is too far from the origin", where=f"{where}.{name}", got=got, expected=expected)
     return np.stack(arrays, axis=1)
 
@@ -107,8 +107,8 @@ def times(record: dict, where: str) -> np.ndarray:
     time_s = column(record, "t", where, None)
     if not (np.diff(time_s) > 0).all():
         k = int(np.argmin(np.diff(time_s)))
-        got = f"{time_s[k]:g}, then {time_s[k + 1]:g}"
-        raise InputError("the times do not increase", where=f"{where}.t", got=got, expected="increasing seconds")
+        got = f"{time_s[k]:g} s, then {time_s[k + 1]:g} s"
+        raise InputError("the times do not increase", where=f"{where}.t", got=got, expected="increasing times")
     return time_s
 
 

@@ -164,13 +164,13 @@ def read_decisions(inspected: Path) -> dict[str, Decision]:
     for decision in journal.read_as(Decision.model_validate):
         if decision.inspection != digest:
             found = f"for the version with sha256 {decision.inspection[:12]}"
-            fix = f"decide again with cosfly inspect review, or restore the `{inspected.name}` that was reviewed"
+            again = f"move {REVIEW} away and decide again with cosfly inspect review"
             raise InputError(
                 f"the review decision was made for a different version of `{inspected.name}`",
                 where=f"{path}:{journal.line_num}",
                 got=f"{decision.verdict} {decision.folder} by {decision.by} at {decision.at}, {found}",
                 expected=f"a decision for {inspected} with sha256 {digest[:12]}",
-                fix=f"move {REVIEW} away and {fix}",
+                fix=f"{again}; or restore the `{inspected.name}` that was reviewed",
             )
         decisions[decision.folder] = decision
     if journal.num_damaged:
@@ -241,8 +241,8 @@ def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[D
                     "the track breaks a rule of the inspection, so it cannot be accepted",
                     where=track.folder,
                     got=track.reason or "rejected",
-                    expected="a track in review",
-                    fix="render the track again, or change the threshold, and run the inspection again",
+                    expected="a track with the result `review`",
+                    fix="render the track again, or change the threshold of this rule, and run the inspection again",
                 )
             file = {"folder": track.folder, "sha256": track.sha256, "inspection": digest}
             decisions.append(Decision(**file, verdict=choice.verdict, reason=choice.reason, by=by, at=now))

@@ -108,10 +108,10 @@ def _read_gltf(text: bytes, binary: bytes, path: Path) -> dict[str, np.ndarray]:
     is_plain = not packed and all("bufferView" in accessors[k] and "sparse" not in accessors[k] for k in used)
     if not is_plain or any("uri" in buffer for buffer in buffers):
         raise InputError(
-            "the mesh file uses an unsupported feature: a glTF extension, a sparse accessor, or data in another file",
+            "the mesh file uses a feature of glTF that is not supported",
             where=path,
-            got=", ".join(packed)[:80] or None,
-            expected="glTF 2.0 without these features, in one file",
+            got=f"a glTF extension: {packed}"[:99] if packed else "a sparse accessor, or data in another file",
+            expected="glTF 2.0 in one file, without sparse accessors and such extensions",
             fix="export the mesh again as .glb without compression and other extensions",
         )
     if any(node.get("mesh", -1) >= len(meshes) for node in nodes):

@@ -99,7 +99,7 @@ def parse_roi(data: bytes, path: Path) -> Roi:
         where = f"{path}: polygon {number}"
         if len(ring) < 3 or numbers(ring, None, 2) is None:
             what = "a ring of the polygon has too few points, or a coordinate that is not a finite number"
-            raise InputError(what, where=where, got=f"{len(ring)} points", expected="three or more finite points")
+            raise InputError(what, where=where, got=f"the ring {ring}"[:80], expected="three or more finite points")
         reason = shapely.is_valid_reason(shapely.Polygon(ring))
         if reason != "Valid Geometry":
             fix = "draw the ring again without crossings"

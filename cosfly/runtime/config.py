@@ -125,7 +125,7 @@ def read_yaml(path: Path) -> dict:
     value = parse_yaml(text, path)
     if not isinstance(value, dict | None):
         what = "the configuration is not a mapping of settings"
-        raise ConfigError(what, where=path, got=json_type(value), expected="lines such as seed: 3")
+        raise ConfigError(what, where=path, got=json_type(value), expected="lines such as `seed: 3`")
     return value or {}
 
 
@@ -138,7 +138,7 @@ def apply_overrides(data: dict, overrides: Iterable[str]) -> dict:
     for override in overrides:
         key, equals, text = override.partition("=")
         if not equals or not all(key.split(".")) or key.count(".") > MOST_PARTS:
-            expected = "key=value, for instance pedestrians.num_paths=3"
+            expected = "`key=value`, for instance `pedestrians.num_paths=3`"
             raise ConfigError("the value of --set is not an assignment", got=override[:80], expected=expected)
         value = parse_yaml(text, f"--set {key}", what="value")
         node = data
@@ -225,7 +225,7 @@ def config_file(config: Path | None) -> Path | None:
     if config.is_dir():
         fix = f"run cosfly list {config} to see the runs in this folder"
         raise ConfigError(
-            "this folder is not a run directory", where=config, got="no run.yaml", expected=expected, fix=fix
+            "this folder is not a run directory", where=config, got="no run.yaml in it", expected=expected, fix=fix
         )
     if is_bare:
         raise ConfigError(

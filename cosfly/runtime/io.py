@@ -263,10 +263,10 @@ def _plain_name(root: Path, name: str) -> str:
     plain = os.path.normpath(name)
     if "\0" in name or max(len(part.encode("utf-8", "surrogatepass")) for part in plain.split(os.sep)) > LONGEST_NAME:
         expected = f"no null character, and at most {LONGEST_NAME} bytes in the name of each folder and file"
-        raise InputError("the path is not a valid file name", where=root, got=name, expected=expected)
+        raise InputError("a path in this folder is not valid", where=root, got=name, expected=expected)
     if os.path.isabs(plain) or plain.split(os.sep)[0] == os.pardir:
         raise InputError(
-            "the path leads out of this folder", where=root, got=name, expected="a relative path inside the folder"
+            "a path leads out of this folder", where=root, got=name, expected="a relative path inside the folder"
         )
     return plain
 
@@ -405,7 +405,7 @@ def read_checksums(folder: Path) -> dict[str, str]:
     for number, line in enumerate(read_text(path, what="checksums", tree=folder).splitlines(), 1):
         digest, _, name = line.partition("  ")
         if len(digest) != 64 or not name:
-            what, fix = "the line of the checksum file is damaged", "copy the folder again from its source"
+            what, fix = "this line of the checksum file is damaged", "copy the folder again from its source"
             expected = "64 hexadecimal digits, two spaces and a file name"
             raise InputError(what, where=f"{path}:{number}", got=line[:80], expected=expected, fix=fix)
         plain = _plain_name(folder, name)

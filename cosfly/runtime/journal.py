@@ -59,7 +59,7 @@ class Journal:
                 detail = error.errors(include_url=False, include_input=False)[0]
                 field = ".".join(str(part)[:40] for part in detail["loc"]) or "top level"
                 raise InputError(
-                    "the line of the journal is not a valid record",
+                    "this line of the journal is not a valid record",
                     where=f"{self.path}:{self.line_num}",
                     got=f"{field}: {plain(detail['msg'])[:200]}",
                     fix="delete this line and run the same command again; cosfly repeats the item of this line",

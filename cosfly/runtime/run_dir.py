@@ -613,11 +613,11 @@ def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], records: M
         sources = [entry for source, entry in record.inputs.items() if _role(source) == role]
         if sources and peer != name and all(entry.sha256 != records[peer].sha256 for entry in sources):
             raise VerifyError(
-                f"{path.name} was made with another input ({role}), or that input has changed since",
+                f"{path.name} was made with another input `{role}`, or that input has changed since",
                 where=path,
                 got=str(inputs[peer]),
                 expected=f"{sources[0].path}, unchanged since then",
-                fix=f"pass the expected {role}, or run the stage that writes {path.name} again",
+                fix=f"pass the expected input, or run the stage that writes {path.name} again",
             )
 
 
