@@ -123,18 +123,18 @@ def test_longitude_and_latitude_become_metres(tmp_path, subtests):
     for settings, more in (({}, {}), ({"units": "degrees"}, {}), ({}, {"crs": crs("urn:ogc:def:crs:OGC:1.3:CRS84")})):
         box_map = loaded(tmp_path, collection(*town, **more), ".geojson", **settings)
         assert_allclose(sorted(box_map.half_extents[0, :2] * 2), [68.677, 111.267], rtol=2e-4)
-    with pytest.raises(InputError, match=r"do not look like metres;.*maps\.boxes\.units=degrees"):
+    with pytest.raises(InputError, match=r"too small to be metres;.*maps\.boxes\.units=degrees"):
         loaded(tmp_path, collection(*town), ".geojson", units="m")
-    with pytest.raises(InputError, match="do not look like degrees"):
+    with pytest.raises(InputError, match="too large to be degrees"):
         loaded(tmp_path, collection(*houses()), ".geojson", units="degrees")
     with pytest.raises(InputError, match="may be metres or degrees"):
         loaded(tmp_path, collection(*houses(scale=0.01)), ".geojson")
     lake = feature("Polygon", square(4.0, 52.0, 0.03), type="Roads")
     assert loaded(tmp_path, collection(lake, crs=crs("EPSG:4326")), ".geojson").half_extents.max() > 1_000
-    with pytest.raises(InputError, match="do not look like degrees"):
+    with pytest.raises(InputError, match="too large to be degrees"):
         loaded(tmp_path, collection(*houses(), crs=crs("EPSG:4326")), ".geojson")
     table = "type,x,y,length,width,height\n" + "".join(f"Buildings,4.{k},52.{k},9,9,9\n" for k in (3001, 3002, 3004))
-    with pytest.raises(InputError, match=r"do not look like metres;.*maps\.boxes\.units=degrees"):
+    with pytest.raises(InputError, match=r"too small to be metres;.*maps\.boxes\.units=degrees"):
         loaded(tmp_path, table)
     assert len(loaded(tmp_path, table, units="degrees")) == 3
     across = loaded(tmp_path, collection(*houses(179.9995, -17.0, DEGREES)), ".geojson")  # the date line
@@ -283,7 +283,7 @@ def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
     text = (tmp_path / "own.json").read_text()
     for declared in ('"units": "ft"', '"crs": "EPSG:2263"', '"up_axis": "y"'):
         (tmp_path / "own.json").write_text(text.replace("{", f"{{{declared},", 1))
-        with pytest.raises(InputError, match="declares a unit or a coordinate system"):
+        with pytest.raises(InputError, match="declares another unit or coordinate system"):
             load(BoxesConfig(path=tmp_path / "own.json"))
 
 

@@ -161,7 +161,7 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
         raise ConfigError(
             "boxes_3d.json contains its own types, units and ground height, so settings for them would have no effect",
             where="maps.boxes",
-            fix=f"remove {', '.join(f'maps.boxes.{name}' for name in sorted(of_tables))}",
+            fix=f"remove the settings {', '.join(f'maps.boxes.{name}' for name in sorted(of_tables))}",
         )
     box_map, rows = (read_boxes(path), []) if suffix == ".json" else _read_rows(cfg, path, suffix)
     settings = cfg.model_dump(include=cfg.model_fields_set & {"name", "licence", "credits"})
@@ -286,18 +286,18 @@ def _units_of(rows: list[_Row], places: np.ndarray, units: Units, path: Path, *,
         _, sizes = shapely.STRtree(points).query_nearest(points, **near)
     seen = seen_units(places, sizes)
     if units == "auto" and seen is None:
-        what, fix = "the coordinates may be metres or degrees", "pass --set maps.boxes.units=m, or degrees"
-        raise InputError(what, where=path, got=f"outlines of {np.median(sizes):.3g} units", fix=fix)
+        what, fix = "the coordinates may be metres or degrees", "set maps.boxes.units to `m` or to `degrees`"
+        raise InputError(what, where=path, got=f"a median size of {np.median(sizes):.3g} units", fix=fix)
     if units == "auto" and seen is not None and not (is_table and seen == "degrees"):
         return seen
     if seen is not None and len(places) > 1 and (seen == "degrees") != (units == "degrees"):
         name = "degrees" if units == "degrees" else "metres"
         raise InputError(
-            f"the coordinates in the file do not look like {name}",
+            f"the coordinates are too {'large' if units == 'degrees' else 'small'} to be {name}",
             where=path,
             got=f"{places.min(axis=0).tolist()} to {places.max(axis=0).tolist()}",
-            expected=f"outlines or distances of {name}",
-            fix=f"if the unit of the coordinates is {seen}, pass --set maps.boxes.units={seen}",
+            expected=f"coordinates in {name}, the unit that maps.boxes.units or the file states",
+            fix=f"if the coordinates are in {seen}, pass --set maps.boxes.units={seen}",
         )
     return units
 

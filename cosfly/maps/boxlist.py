@@ -141,7 +141,7 @@ def check_not_empty(box_map: BoxMap, where: str, fix: str = "") -> None:
     if not len(box_map):
         got = f"{box_map.header.num_objects} objects, dropped: {counts_text(box_map.header.dropped_objects)}"
         expected = "at least one object with a size"
-        raise InputError("the map has no boxes", where=where, got=got, expected=expected, fix=fix)
+        raise InputError("the map has no boxes", where=where, got=got, expected=expected, fix=fix or None)
 
 
 def served(box_map: BoxMap, ground_z_m: float | None, is_road: np.ndarray, where: str, fix: str) -> BoxMap:

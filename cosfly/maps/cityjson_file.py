@@ -201,7 +201,7 @@ def _read_parts(path: Path) -> tuple[str, _Document, list[tuple[str, _Part]]]:
                 where=f"{where}: type",
                 got=object_type,
                 expected=repr(expected),
-                fix=None if parts else "pass a CityJSON file, or a sequence whose first line is of type CityJSON",
+                fix="pass a CityJSON file, or a sequence of a CityJSON object and CityJSONFeature objects",
             )
         if not parts:
             version = ".".join(str(value.get("version")).split(".")[:2])  # 1.1.3 is 1.1
@@ -230,7 +230,7 @@ def _vectors(values: list[Any], where: str) -> np.ndarray:
     """Return lists of three numbers as (n, 3)."""
     vectors = numbers(values, None, 3) if values else np.empty((0, 3))
     if vectors is None:
-        raise InputError("a vertex is malformed", where=where, expected="lists of three finite numbers", fix=VALIDATE)
+        raise InputError("a vertex is not a list of three finite numbers", where=where, fix=VALIDATE)
     return vectors
 
 
@@ -320,7 +320,7 @@ def _rings(surface: _Surface, vertices: np.ndarray, where: str) -> Surface:
         raise InputError(what, where=where, got=str(highest)[:60], expected=expected, fix=VALIDATE)
     rings = [vertices[ring] for ring in surface]
     if not all(np.isfinite(ring).all() for ring in rings):
-        raise InputError("a coordinate is not finite", where=where, expected="finite coordinates", fix=VALIDATE)
+        raise InputError("a coordinate is not a finite number", where=where, fix=VALIDATE)
     if (num_vertices := sum(map(len, rings))) > MOST_VERTICES:
         got = f"a surface of {num_vertices:,} vertices"
         raise over_limit(where, got, f"{MOST_VERTICES:,} vertices", "simplify the surface")

@@ -68,7 +68,7 @@ class SimWorldConfig(Config):
     def inputs(self) -> dict[str, Path]:
         world = required(self.world, "maps.simworld.world")
         if world.is_dir():  # its size table would be looked for next to the folder
-            raise InputError("the path of the world is a folder", where=world, expected="a JSON file of SimWorld")
+            raise InputError("maps.simworld.world is a folder", where=world, expected="a JSON file of SimWorld")
         tables = self.sizes or [world.parent / "Bbox.json"]
         for path in tables:
             if not path.is_file():

@@ -84,7 +84,7 @@ class SyntheticConfig(Config):
             raise ValueError(f"there is no preset {self.preset!r}{hint}; choose one of {', '.join(PRESETS)}")
         if (side := self.plan.narrowest_block_m) < MIN_BLOCK_M:
             expected = f"at least {MIN_BLOCK_M:.0f} m"
-            raise ValueError(f"the blocks are {side:.1f} m wide, not {expected}; raise size_m or lower num_blocks")
+            raise ValueError(f"the blocks are {side:.1f} m wide; expected {expected}; raise size_m or lower num_blocks")
         return self
 
     @property

@@ -56,12 +56,12 @@ def declared_units(declared: Any, where: str) -> Units | None:
 def refused(declared: str, where: str) -> InputError:
     """Return the error of a coordinate system that a reader cannot use."""
     return InputError(
-        "the declared coordinate system is not one of metres or of WGS 84 degrees that this reader knows",
+        "the declared coordinate system is not supported",
         where=where,
         got=declared[:80],
         expected="EPSG:4326 (not in CityJSON), or true metres such as UTM (EPSG:326NN)",
-        fix="convert the file (ogr2ogr -t_srs EPSG:4326, cjio reproject), or set the unit of its coordinates, m, ft "
-        "(0.3048 m) or us-ft (0.3048006 m), by maps.boxes.units or maps.cityjson.units",
+        fix="convert the file (ogr2ogr -t_srs EPSG:4326, cjio reproject), or set maps.boxes.units or "
+        "maps.cityjson.units to the unit of its coordinates: m, ft (0.3048 m) or us-ft (0.3048006 m)",
     )
 
 
