@@ -88,11 +88,11 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
         (("caption", "prompts", "--export", "taken"), ("taken", "cannot be written", "--out")),
         (
             ("run", "quickstart", "--out", "stage"),
-            ("stage: the output directory is the folder of a stage", "choose another --out"),
+            ("stage: the output directory contains the output of a single stage", "choose another --out"),
         ),
         (
             ("run", "quickstart", "--out", "stage", "--dry-run"),
-            ("stage: the output directory is the folder of a stage", "another --out"),
+            ("stage: the output directory contains the output of a single stage", "another --out"),
         ),
         (("--log-file", "no/log.txt", "config", "show"), ("the log file cannot be written",)),
     ):

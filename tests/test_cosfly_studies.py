@@ -180,7 +180,7 @@ def test_what_cannot_be_measured(tmp_path):
     with pytest.raises(ConfigError, match=r"the benchmark cannot measure this stage.*simplify.*render"):
         run(RunConfig(), tmp_path, tmp_path / "out", "simplify", [1])
     asked = RunConfig.model_validate({"caption": {"teacher": "http://127.0.0.1:9"}})
-    with pytest.raises(ConfigError, match="its speed does not depend on workers"):
+    with pytest.raises(ConfigError, match="a teacher or judge on a server does not use"):
         run(asked, tmp_path, tmp_path / "out", "caption", [1])
     (tmp_path / "out").mkdir()
     (tmp_path / "out/mine").touch()

@@ -172,7 +172,7 @@ class Job:
         num_failed = sum(counts.total() for counts in failed.values())
         if num_failed > self.cfg.max_failed:
             raise InputError(
-                "more items failed than the setting max_failed allows; all other items are complete",
+                "more items failed than the setting `max_failed` allows; all other items are complete",
                 where=where,
                 got="; ".join(f"{stage}: {counts_text(counts)}" for stage, counts in failed.items()),
                 expected=f"at most {self.cfg.max_failed} failed items",

@@ -127,7 +127,7 @@ def view(
         if (dataset / RECORD).is_file():
             raise InputError(
                 "a release has no page", where=dataset, expected="a map, a playback tree or a run directory",
-                fix=f'open it with data = datasets.load_dataset("{dataset}"), or view the run that it is made of',
+                fix=f'load the release with datasets.load_dataset("{dataset}"), or pass the run that it was built from',
             )  # fmt: skip
     if source.is_file():
         job.call(

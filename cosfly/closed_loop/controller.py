@@ -53,7 +53,7 @@ def read_controls(path: Path, tokens: tuple[str, ...]) -> dict[str, Control]:
     controls = build(ControlTable, read_yaml(path), path).actions
     if missing := [token for token in tokens if token not in controls]:
         problem = f"the controller table has no command for the decisions {', '.join(missing)}"
-        raise ConfigError(problem, where=path, fix="add an entry for each of these decisions under actions")
+        raise ConfigError(problem, where=path, fix="add an entry for each of these decisions under `actions`")
     return controls
 
 

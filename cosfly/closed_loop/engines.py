@@ -247,7 +247,7 @@ class LocalEngine(PromptedEngine):
         self._has_reasons = cfg.reasons
         if not cfg.reasons and read_chat_format(cfg.adapter or model).decision != "first":
             raise ConfigError(
-                "the student writes its reasons before its decision", where="fly.reasons", got="false",
+                "the student writes its reasons before its decision", where="fly.reasons", got="false", expected="true",
                 fix="leave fly.reasons at true, or train a student with distill.prepare.decision=first",
             )  # fmt: skip
         self._local = LocalAnswers(infer, inputs, self._book, stop="" if cfg.reasons else DECISION_END)

@@ -100,7 +100,7 @@ class Policy:
         self._num_late = self._num_late + 1 if decision.answer == "late" else 0
         if self._most_late and self._num_late >= self._most_late:
             raise TeacherError(
-                "the policy hangs and was stopped",
+                "the policy did not answer in time and was stopped",
                 where=self.name,
                 got=f"{self._num_late} decisions in a row without an answer in {self._limit_s:g} s",
                 fix="correct the policy, or raise fly.answer_limit_s or fly.most_late_answers",

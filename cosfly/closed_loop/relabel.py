@@ -50,7 +50,7 @@ def run(
         raise ConfigError(
             "relabeling needs the planner foresight, because no other planner can start at the pose of a student",
             where=f"plan.planner and {flown / PLAN}",
-            got=", ".join(sorted(planners)),
+            got=f"the planners {', '.join(sorted(planners))}",
             fix="fly the student again with --set plan.planner=foresight, and relabel with the same setting",
         )
     begun = (TREE, CAPTIONS)
@@ -77,7 +77,7 @@ def _seed_of(flown: Path, cfg: ClosedLoopConfig) -> int:
     if begun.stage != "fly":
         what = "the folder to relabel is not the output directory of `cosfly fly --map --paths`"
         fix = "pass the output directory of that command"
-        raise InputError(what, where=flown, got=f"output of the stage {begun.stage}", fix=fix)
+        raise InputError(what, where=flown, got=f"the output of the stage `{begun.stage}`", fix=fix)
     if "others" in begun.inputs:
         raise InputError(
             "the recorded episodes have bystanders, but --relabel cannot render bystanders",

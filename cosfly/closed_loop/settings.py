@@ -122,7 +122,7 @@ class FlyConfig(Config):
     @model_validator(mode="after")
     def _is_known(self) -> Self:
         if self.engine not in ENGINES:
-            raise ValueError(f"the student {self.student!r} is unknown{nearest(self.student, ENGINES)}; use {KINDS}")
+            raise ValueError(f"fly.student {self.student!r} is unknown{nearest(self.student, ENGINES)}; use {KINDS}")
         if self.adapter is not None and self.engine != "transformers":
             raise ValueError(
                 f"fly.adapter works only with fly.student=transformers:MODEL_DIR, but fly.student is {self.student!r}"

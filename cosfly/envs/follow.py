@@ -139,7 +139,7 @@ class FollowEnv(gymnasium.Env):
                 "no pedestrian trajectory is suitable for an episode: no drone trajectory was found, or the target's "
                 "visibility at the start does not suit the environment",
                 where=f"{self.task}: {town.name}",
-                got=f"{len(numbers)} pedestrian trajectories",
+                got=f"{len(numbers)} unsuitable pedestrian trajectories",
                 fix="call reset with another seed or episode",
             )
         return self._observation(), self._info()

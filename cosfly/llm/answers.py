@@ -168,7 +168,7 @@ class BudgetConfig(Config):
     def _priced(self) -> Self:
         if self.max_cost is not None and self.price_prompt == self.price_completion == 0:
             raise ValueError(
-                "max_cost requires price_prompt or price_completion, because without a price the cost is always 0"
+                "max_cost requires `price_prompt` or `price_completion`, because without a price the cost is always 0"
             )
         return self
 

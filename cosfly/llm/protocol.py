@@ -221,7 +221,7 @@ def _joined_events(content: bytes, reject: Callable[[str], float]) -> dict[str, 
             if isinstance(piece, str):
                 texts[name] = texts.get(name, "") + piece
     if finish_reason is None:
-        raise ValueError("the event stream ends before the answer does")
+        raise ValueError("the event stream ends before the answer is complete")
     return {"choices": [{"message": texts, "finish_reason": finish_reason}], "usage": usage}
 
 

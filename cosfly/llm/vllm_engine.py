@@ -53,7 +53,7 @@ class VllmEngine:
         """
         if not (folder / "config.json").is_file():
             fix = "pass vllm:MODEL_DIR with the folder of a model"
-            raise InputError("the folder contains no model, which has a config.json", where=folder, fix=fix)
+            raise InputError("the folder contains no model", where=folder, got="no config.json", fix=fix)
         self.folder = folder
         self.model = folder.name
         self.where = f"vllm:{folder}"

@@ -113,7 +113,7 @@ class Editor:
                 where=self.where,
                 got=f"{num_x} x {num_y} cells",
                 expected=f"at most {MOST_SIDE} cells a side and {MOST_CELLS:,} cells in all",
-                fix="set a larger pedestrians.resolution_m to draw; the region is stored in metres, so it stays valid",
+                fix="set a larger pedestrians.resolution_m to draw; the region, which is stored in metres, stays valid",
             )
         self.bare = walkable_ground(self.box_map, self.cfg, where=self.where)
         self.opened = None

@@ -269,8 +269,8 @@ def walkable_ground(
         raise NoPathError(
             "all walkable ground is road, but pedestrian trajectories must start and end off the road", where=where,
             got=f"{counts['cells_used']} walkable cells, all Roads",
-            fix="add such boxes, or set pedestrians.road_cost to 1, which allows starts and ends on roads",
-            expected="pavements, squares or paths (Sidewalks, Ground)",
+            fix="add boxes of type Sidewalks or Ground, or allow starts on roads with pedestrians.road_cost=1",
+            expected="pavements, squares or paths",
         )  # fmt: skip
     return ground
 
@@ -370,12 +370,12 @@ def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | 
             where=where,
             got=f"{counts['cells_free']} free cells, all on other ground",
             expected="at least one free cell on this kind of ground",
-            fix="set pedestrians.ground to surfaces or anywhere",
+            fix="set pedestrians.ground to `surfaces` or `anywhere`",
         )
     raise NoPathError(
         "the region of interest has no walkable cell",
         where=roi_where,
-        got=f"{counts['cells_in_roi']} of {counts['cells']} map cells lie in the region, 0 of them free",
+        got=f"0 free cells among the {counts['cells_in_roi']} map cells in the region",
         expected="a polygon in world metres of this map, over free ground",
         fix="draw the region over free ground of this map",
     )

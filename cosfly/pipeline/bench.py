@@ -65,10 +65,10 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
         raise ResumeError("the output directory is not empty", where=out, fix="choose another --out")
     if stage == "caption" and (cfg.caption.teacher_kind not in EMBEDDED or cfg.caption.judge.url):
         raise ConfigError(
-            "the benchmark cannot measure a teacher or judge on a server, because its speed does not depend on workers",
+            "the benchmark varies the workers, which a teacher or judge on a server does not use",
             where="caption.teacher",
-            got=cfg.caption.teacher,
-            expected=f"the teacher {' or '.join(sorted(EMBEDDED))}, and no caption.judge.url",
+            got=f"{cfg.caption.teacher}, and {'a' if cfg.caption.judge.url else 'no'} caption.judge.url",
+            expected=f"{' or '.join(sorted(EMBEDDED))}, and no caption.judge.url",
             fix="pass --set caption.teacher=rules and remove caption.judge.url",
         )
     rows = [_measure(cfg, run_folder, out / f"workers_{count}", stage, count) for count in sorted(set(workers))]

@@ -156,18 +156,18 @@ def check(cfg: RunConfig) -> None:
         if missing := ", ".join(sorted(set(cfg.release.modalities) - set(town.render.modalities))):
             rendered = ", ".join(town.render.modalities)
             raise ConfigError(
-                "release.modalities contains kinds of pictures that the run does not render",
+                f"release.modalities contains {missing}, but the run does not render these pictures",
                 where="render.modalities",
-                got=f"{rendered}, without {missing}",
+                got=rendered,
                 fix=f"add {missing} to render.modalities, or pass --set 'release.modalities=[{rendered}]'",
             )
         absent = ", ".join(sorted(set(cfg.release.tracks) - set(town.render.tracks)))
         if cfg.release.pairs == "both" and absent:
             rendered = ", ".join(town.render.tracks)
             raise ConfigError(
-                "release.tracks contains tracks that the run does not render",
+                f"release.tracks contains {absent}, but the run does not render these tracks",
                 where="render.tracks",
-                got=f"{rendered}, without {absent}",
+                got=rendered,
                 fix=f"add {absent} to render.tracks, or pass --set 'release.tracks=[{rendered}]'",
             )
 
@@ -189,9 +189,9 @@ def check_out(out: Path) -> None:
     """Refuse to make a run in the folder of a stage: its tree would hold a second one."""
     if (out / "stage.json").exists() and not (out / "run.yaml").exists():
         raise ResumeError(
-            "the output directory is the folder of a stage, not of a run",
+            "the output directory contains the output of a single stage, not of a run",
             where=out,
-            got="a stage.json without a run.yaml",
+            got="stage.json, but no run.yaml",
             fix="choose another --out, such as the run directory above this folder",
         )
 

@@ -318,6 +318,6 @@ def _ids_in_pictures(server: CarlaConnection, box_map: BoxMap, num_others: int) 
         fix = "export the map from this town (cosfly maps --source carla), or name its town in render.carla.town"
         raise InputError(what, where=where, got=f"the map {box_map.name}", fix=fix)
     if num_found < len(box_map) or num_doubtful:
-        what = "%s: %d of %d boxes have an id in the pictures; %d of these share their 16-bit id with another box"
-        log.warning(what, where, num_found, len(box_map), num_doubtful)
+        note = "%s: %d of %d boxes have an id in the pictures; %d of these share their 16-bit id with another box"
+        log.warning(note, where, num_found, len(box_map), num_doubtful)
     return table

@@ -104,8 +104,8 @@ class PyrenderRenderer:
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
         """Check that no weather is asked for; there are no shadows to compute."""
         if weather is not None:
-            fix = "set render.backend to gl, or render.weather_mode to off"
-            raise RenderError("the renderer pyrender cannot draw weather", fix=fix)
+            fix = "set render.backend to `gl`, or render.weather_mode to `off`"
+            raise RenderError("the renderer `pyrender` cannot draw weather", fix=fix)
 
     def render(
         self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None, others: Others = ()

@@ -95,7 +95,7 @@ class RenderConfig(WeatherConfig):
     @model_validator(mode="after")
     def _weather_can_be_drawn(self) -> RenderConfig:
         if self.backend in SIMULATORS and self.look != Look():
-            raise ValueError(f"render.look has no effect on the simulator {self.backend}; remove render.look")
+            raise ValueError(f"render.look has no effect on the simulator `{self.backend}`; remove render.look")
         if self.weather_mode != "off" and self.backend in ("pyrender", "unrealcv"):
             raise ValueError(f"render.weather_mode must be off with {self.backend}; only gl and carla can draw weather")
         if self.weather_mode != "off" and self.look != Look():

@@ -124,8 +124,8 @@ class UnrealCvRenderer(SimulatorRenderer):
             fix = "export the map from this level (cosfly maps --source unrealcv)"
             raise InputError(what, where=self._server.where, got=f"the map {self._map.name}", fix=fix)
         if len(linked) < len(self._map) or num_doubtful:
-            what = "%s: %d of %d boxes are objects of the level; %d objects share their colour with another"
-            log.warning(what, self._server.where, len(linked), len(self._map), num_doubtful)
+            note = "%s: %d of %d boxes are objects of the level; %d objects share their colour with another"
+            log.warning(note, self._server.where, len(linked), len(self._map), num_doubtful)
         self._check_scale(linked)
 
     def _check_scale(self, linked: dict[str, int]) -> None:
@@ -177,8 +177,8 @@ class UnrealCvRenderer(SimulatorRenderer):
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
         """Remove all people and cars; the weather of the level stays."""
         if weather is not None:
-            fix = "set render.backend to gl or carla, or render.weather_mode to off"
-            raise RenderError("the renderer unrealcv cannot draw weather", where=self.device, fix=fix)
+            fix = "set render.backend to `gl` or `carla`, or render.weather_mode to `off`"
+            raise RenderError("the renderer `unrealcv` cannot draw weather", where=self.device, fix=fix)
         with self._server.asking("UnrealCV did not remove people"):
             for number in list(self._spawned):
                 self._server.run(self._removal(number))

@@ -144,9 +144,9 @@ def read_pools(cfg: WeatherConfig) -> Pools:
         kinds = pools.pairs_by_kind()
         if missing := [kind for kind, share in cfg.sky_shares.items() if share and kind not in kinds]:
             raise ConfigError(
-                f"render.sky_shares names {', '.join(missing)}, but the weather and time pools have no such preset",
+                f"the weather and time pools have no presets for the kinds of sky {', '.join(missing)}",
                 where="render.sky_shares",
-                fix="remove these names, or add presets of these kinds of sky to the pools",
+                fix="remove these kinds of sky from render.sky_shares, or add presets for them to the pools",
             )
     return pools
 

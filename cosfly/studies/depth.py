@@ -82,7 +82,7 @@ def study_of(reference_m: np.ndarray, frame: str) -> tuple[dict[str, Any], dict[
 def _check_depths(depths_m: np.ndarray, frame: str) -> None:
     if not depths_m.size or depths_m.min() == depths_m.max() or depths_m.min() < 0:
         got = f"{depths_m.min():g} to {depths_m.max():g} m" if depths_m.size else "no measured pixel"
-        what, expected = "the depth image has too few different depths", "at least two different depths of 0 m or more"
+        what, expected = "the depth image needs two different depths", "at least two different depths, none below 0 m"
         raise InputError(what, where=frame, got=got, expected=expected)
 
 

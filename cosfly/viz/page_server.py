@@ -70,7 +70,7 @@ class _Handler(BaseHTTPRequestHandler):
             return self._send(404, b"", "text/plain")
         if not length.isdecimal() or int(length) > MOST_BYTES:
             expected = f"at most {MOST_BYTES} bytes"
-            return self._send_error(InputError("the request is too large", got=length, expected=expected))
+            return self._send_error(InputError("the request is too large", got=length or "no size", expected=expected))
         try:
             self._send(200, site.answer(name, self.rfile.read(int(length))), "application/octet-stream")
         except CosflyError as error:

@@ -134,7 +134,7 @@ class WorldPlan(BaseModel):
                     f"{name} is {low:g} to {high:g}, but must lie within {least:g} to {most:g}, the lower value first"
                 )
         if self.size_m and not 80.0 <= min(self.size_m) <= max(self.size_m) <= 2000.0:
-            raise ValueError(f"size_m is {self.size_m[0]:g} x {self.size_m[1]:g}, but must lie within 80 to 2000")
+            raise ValueError(f"size_m is {self.size_m[0]:g} x {self.size_m[1]:g}, but must lie within 80 to 2000 m")
         edges_m = 2 * VERGE_M + max(self.avenue_m, self.street_m) + self.river_m
         if self.size_m and min(self.size_m) < edges_m + LEAST_INSIDE_M:
             expected = f"{edges_m + LEAST_INSIDE_M:g} m for its edges, river and widest street"

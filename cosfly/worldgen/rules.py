@@ -324,7 +324,7 @@ class _Reader:
             high = LOW_TOWN_M
         if high is not None and not 3.0 <= max(low, 3.0) <= high <= 450.0:
             got = " ".join(match[0].strip() for match in limits.values())
-            expected = "a lowest and a highest height, within 3 to 450 m"
+            expected = "a lowest height below the highest, both within 3 to 450 m"
             raise InputError("the range of building heights is impossible", where="PROMPT", got=got, expected=expected)
         kinds = [
             word for name, one in WORDS["buildings"].items() if name != "building" for word in _words(one["words"])

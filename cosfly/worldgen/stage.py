@@ -155,7 +155,7 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
     try:
         reply = asyncio.run(ask())
     except NoAnswer as error:
-        fix = error.fix or None
+        fix = error.fix or "check the server of --planner"
         raise TeacherError("the language model gave no answer", where=client.url, got=str(error), fix=fix) from None
     trace = {
         "planner": "model", "url": cfg.planner, "model": client.model, "seed": seed, "messages": messages,
