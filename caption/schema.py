@@ -238,10 +238,10 @@ class CaptionConfig(Config):
         kind = self.teacher_kind
         if kind == "rules" and self.writing != "slots":
             raise ValueError(
-                f"the rule teacher supports only writing=slots, got {self.writing!r}; choose another teacher"
+                f"the teacher `rules` needs writing=slots, got {self.writing!r}; set writing, or choose another teacher"
             )
         if self.student.folder is not None and kind not in ("endpoint", "vllm"):
-            raise ValueError(f"student.folder needs a model as teacher (URL or vllm:MODEL_DIR), got {self.teacher!r}")
+            raise ValueError(f"student.folder needs the teacher URL or vllm:MODEL_DIR, got {self.teacher!r}")
         if kind == "endpoint":
             try:
                 check_url(self.teacher)

@@ -255,8 +255,8 @@ class Asking:
                 f"none of the first {limit} answers was accepted",
                 where=self.cfg.teacher,
                 got=explain_drops(self.dropped),
-                fix=f"read {self.stage.path / ANSWERS}/*.jsonl, run `cosfly caption doctor`, or continue with "
-                "--set caption.stop_after_dropped=0",
+                fix=f"to see why, read {self.stage.path / ANSWERS}/*.jsonl or run `cosfly caption doctor`; to continue "
+                "anyway, pass --set caption.stop_after_dropped=0",
             )
 
 

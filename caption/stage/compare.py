@@ -106,8 +106,8 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
     refuse_links(out)
     num_windows, trials = run_until_interrupted(_try_all(cfg, vocabulary_of(cfg), data, out, seed, conflicts))
     if not trials:
-        what, fix = "no first answer has a conflict to repair", "pass another --teacher"
-        raise InputError(what, where=data, got=f"{num_windows} windows", fix=fix)
+        what, fix = "the first answers have no conflict, so there is nothing to compare", "pass another --teacher"
+        raise InputError(what, where=data, got=f"{num_windows} windows without conflict", fix=fix)
     comparisons = list(map(compare, STRATEGIES, zip(*trials, strict=True)))
     value = {
         "schema": "cosfly.compare_strategies",

@@ -65,7 +65,7 @@ def run(
     """
     if cfg.teacher_kind in EMBEDDED and retry_failed:
         what, fix = "this teacher asks no server, so no window has to be retried", "remove --retry-failed"
-        raise ConfigError(what, where="--retry-failed", got=cfg.teacher_kind, fix=fix)
+        raise ConfigError(what, where="--retry-failed", got=f"the teacher `{cfg.teacher_kind}`", fix=fix)
     vocabulary = vocabulary_of(cfg)
     cfg = student_settings(cfg, vocabulary)
     unused = set[str]() if cfg.caption_file is None else {sample_id for sample_id, _ in read_given(cfg)[0]}
@@ -188,9 +188,9 @@ def _has_more(stage: StageFolder, cfg: CaptionConfig, retry_failed: bool) -> boo
         return False
     if wanted < manifest.counts.input:
         raise ResumeError(
-            "the directory contains more windows than the limit allows, so it is not changed", where=stage.path,
-            got=f"{manifest.counts.input} windows", expected=f"at most {cfg.limit} (caption.limit)",
-            fix="remove --limit, or raise it",
+            "the directory already contains more windows than caption.limit allows", where=stage.path,
+            got=f"{manifest.counts.input} windows", expected=f"at most {cfg.limit} windows",
+            fix="remove or raise --limit",
         )  # fmt: skip
     return True
 

@@ -37,8 +37,8 @@ def show_windows(
         TeacherError: No window gets an answer.
     """
     if cfg.teacher_kind in EMBEDDED:
-        what = "a trial shows questions and answers, and this teacher asks no model"
-        raise ConfigError(what, where="--try", got=cfg.teacher, expected="--teacher URL or vllm:MODEL_DIR")
+        what = "a trial shows questions to a model and its answers, but this teacher asks no model"
+        raise ConfigError(what, where="--try", got=f"--teacher {cfg.teacher}", expected="a URL or vllm:MODEL_DIR")
     vocabulary = vocabulary_of(cfg)
     cfg = student_settings(cfg, vocabulary)
     if open_stage(cfg, data, out, seed, resume).is_complete:
@@ -47,7 +47,7 @@ def show_windows(
     tracks, _ = find_inputs(cfg, data)
     left = [track for track in tracks if track.guess_num_windows(cfg.window) and not track.part(out).exists()]
     if not left:
-        raise InputError("no window is left to caption", where=data, got=f"{len(tracks)} tracks")
+        raise InputError("all tracks are captioned or too short", where=data, got=f"{len(tracks)} tracks")
     chosen = [left[number * len(left) // num_windows] for number in range(num_windows)]
     windows = [w for track in dict.fromkeys(chosen) for w in islice(track.windows(cfg), chosen.count(track))]
     exchanges: dict[str, list[tuple[Request, Reply]]] = {window.observed.sample_id: [] for window in windows}
@@ -65,7 +65,7 @@ def show_windows(
         if not isinstance(outcome, Caption | NoAnswer | CosflyError):
             raise outcome
     if not any(isinstance(outcome, Caption) for outcome in outcomes):
-        what, got = "none of the trial windows got an answer", next(map(str, outcomes), None)
+        what, got = "none of the trial windows got an answer", next(map(str, outcomes), "no window")
         raise TeacherError(what, where=cfg.teacher, got=got)
     for (sample_id, exchanged), outcome in zip(exchanges.items(), outcomes, strict=True):
         yield f"=== {sample_id} ==="

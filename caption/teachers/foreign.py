@@ -59,18 +59,18 @@ def read_given(cfg: CaptionConfig) -> tuple[Answers, str]:
 def read_foreign(path: Path) -> Answers:
     """Read captions that were written elsewhere."""
     answers: Answers = {}
-    fix = "pass --teacher file:PATH, a file with one caption per line"
+    fix = "pass --teacher file:PATH with a file of one caption per line"
     for number, (_, caption) in enumerate(model_lines(path, ForeignCaption, what="foreign captions", fix=fix), 1):
         sample_id = caption.sample_id
         if (sample_id, "en") in answers:
             what = "the file has two captions for the same window"
-            raise InputError(what, where=f"{path}:{number}: sample_id", got=sample_id)
+            raise InputError(what, where=f"{path}:{number}: sample_id", got=sample_id, fix="remove one of them")
         texts: dict[Language, Coc | None] = {"en": caption.en, "zh": caption.zh}
         for language, coc in texts.items():
             if coc is not None:
                 answers[sample_id, language] = Reply(dump_json(coc.model_dump()), None, "native", "stop")
     if not answers:
-        raise InputError("the file contains no caption", where=path, fix=fix)
+        raise InputError("the file contains no captions", where=path, fix=fix)
     return answers
 
 
@@ -90,12 +90,12 @@ def read_student(path: Path, run: str | None = None) -> tuple[Answers, str]:
         for one in chosen
     }
     if len(answers) < len(chosen):
-        fix = "choose one of these trees with --set caption.student.run=NAME"
-        what = "the predictions are for several trees with the same track names"
+        fix = "choose one of these runs with --set caption.student.run=NAME"
+        what = "the predictions are for several runs with the same track names"
         raise InputError(what, where=path, got=runs, fix=fix)
     if not answers:
-        expected, fix = f"one of {runs}" if runs else None, "pass the output of cosfly distill infer"
-        raise InputError("the file contains no prediction", where=path, got=run, expected=expected, fix=fix)
+        what, got = f"the file contains no predictions for {run or 'any run'}", f"predictions for {runs or 'no run'}"
+        raise InputError(what, where=path, got=got, fix="pass the output of cosfly distill infer for this run")
     return answers, ", ".join(sorted({one.model or "a student" for one in chosen}))
 
 

@@ -43,9 +43,9 @@ def student_settings(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfi
     first = chat_format.looks[0]
     kinds = {(look.views, look.depth_range_m, max(look.size_px)) for look in chat_format.looks}
     if len(kinds) > 1:
-        what = "the student was trained with pictures of several kinds"
+        what = "a student that was trained with pictures of several kinds cannot write captions"
         got = "; ".join(_described(look.views, look.size_px) for look in chat_format.looks)
-        raise ConfigError(what, where=folder, got=got)
+        raise ConfigError(what, where=folder, got=got, expected="pictures of one kind")
     sampling = {name: getattr(StudentEndpointConfig(), name) for name in ("temperature", "top_p", "extra_body")}
     return cfg.model_copy(update={
         "writing": "prose",
@@ -64,13 +64,13 @@ def check_prompts(chat_format: ChatFormat, folder: Path, vocabulary: Vocabulary)
     """Check that prompts are written today as they were in the student's training."""
     if "en" not in chat_format.prompts:
         what = "the student was not trained with English answers"
-        raise ConfigError(what, where=folder, got=", ".join(chat_format.prompts))
+        raise ConfigError(what, where=folder, got=f"answers in {', '.join(chat_format.prompts)}")
     for language, prompt in chat_format.prompts.items():
         is_same = prompt.system == system_prompt(f"system_{language}", vocabulary)
         if not (is_same and _is_of_template(prompt.user, language, chat_format, vocabulary)):
             raise ConfigError(
                 "the student was trained with another version of the prompt", where=f"{folder}: {language}",
-                got=prompt.user[:80],
+                got=f"the prompt {prompt.user[:80]!r}",
                 fix="use the prompts (caption.prompts, caption.text_state) and the version of cosfly that captioned "
                 "its training set, or train the student again",
             )  # fmt: skip
