@@ -119,10 +119,10 @@ def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
             what = "the training set was not made of this playback tree"
             expected = ", ".join(f"{run}: {sha256}" for run, sha256 in wanted.items())
             fix = "pass the unchanged trees of the training set, or prepare a training set from this tree"
-            raise InputError(what, where=path, got=digest, expected=expected, fix=fix)
+            raise InputError(what, where=path, got=f"the digest {digest}", expected=expected, fix=fix)
     if missing := [run for run, digest in wanted.items() if digest not in found]:
-        what, fix = "a playback tree of the training set is missing", "pass --data once for each of its trees"
-        raise InputError(what, where=dataset, expected=f"--data also for the runs {', '.join(missing)}", fix=fix)
+        problem, again = "--data lacks playback trees of the training set", "pass --data for these trees, too"
+        raise InputError(problem, where=dataset, expected=f"also the trees of {', '.join(missing)}", fix=again)
     return {run: found[digest] for run, digest in wanted.items()}
 
 

@@ -111,7 +111,7 @@ class WindowDataset(Sequence[WindowData]):
         self._shards = [TableRows(path, self._columns) for path in paths]
         self._places = [place for number, path in enumerate(paths) for place in self._places_in(number, path)]
         if not self._places:
-            what, expected = "the source has no usable window", f"accepted captions in {language!r} whose frames exist"
+            what, expected = "the release has no usable window", f"accepted captions in {language!r} with all frames"
             fix = "build the release with --set release.selection=windows, which keeps consecutive frames"
             raise InputError(what, where=source, expected=expected, fix=fix)
 
@@ -124,13 +124,13 @@ class WindowDataset(Sequence[WindowData]):
         if wrong := [name for name in (*self._columns, *light) if types.get(name) != TYPES.get(name, pa.string())]:
             fix = "build the release with this version of cosfly, or download it with --modality rgb"
             got = ", ".join(wrong)[:200]
-            raise InputError("columns are missing or have the wrong type", where=path, got=got, fix=fix)
+            raise InputError("columns are missing or of the wrong type", where=path, got=got, fix=fix)
         rows: dict[tuple[str, ...], dict[int, int]] = {}
         captioned: list[tuple[tuple[str, ...], str, tuple[int, ...]]] = []
         for number, row in enumerate(rows_of(path, light, tree=self.folder)):
             flight = tuple(row[part] for part in PLACE)
             if None in (*flight, row["sample_id"], row["frame_index"]):
-                raise InputError("the frame has no id", where=f"{path}: row {number}", got=shown(list(flight)))
+                raise InputError("a part of the id is null", where=f"{path}: row {number}", got=shown(list(flight)))
             rows.setdefault(flight, {})[row["frame_index"]] = number
             if row[text] and row["caption_window"]:
                 captioned.append((flight, row["sample_id"], tuple(row["caption_window"])))
@@ -147,7 +147,7 @@ class WindowDataset(Sequence[WindowData]):
         last, language = rows[-1], self.language
         system, user = last[f"system_{language}"], last[f"prompt_{language}"]
         if not isinstance(system, str) or not isinstance(user, str):
-            raise InputError("the caption has no prompt", where=place.sample_id)
+            raise InputError("the caption has no prompt", where=place.sample_id, fix="caption the run again")
         pictures = [row["image"] and row["image"]["bytes"] for row in rows]
         if not all(pictures):
             fix = "download the release with --modality rgb"

@@ -188,7 +188,7 @@ def test_the_walk_of_a_flight_decides_its_split_and_not_its_name(tmp_path):
 def test_a_window_that_is_captioned_twice_is_refused(tree, tmp_path):
     records = make_captions(tmp_path / "all.jsonl", tree)
     write_captions(tmp_path / "captions.jsonl", [*records, records[3]])
-    with pytest.raises(InputError, match=f"{records[3].sample_id}: two captions are of the same window"):
+    with pytest.raises(InputError, match=f"{records[3].sample_id}: the captions have two lines for this window"):
         prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
 
 

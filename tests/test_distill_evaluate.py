@@ -165,7 +165,7 @@ def test_paired_differences():
 def test_students_are_measured_on_the_samples_of_all(samples):
     found = {"a": {p.key: p for p in predictions_of(samples)}, "b": {p.key: p for p in predictions_of(samples)[2:]}}
     assert asked_samples(samples, found) == samples[2:]
-    with pytest.raises(InputError, match="does not contain the sample"):
+    with pytest.raises(InputError, match="does not contain this sample"):
         asked_samples(samples[1:], found)
 
 

@@ -159,7 +159,7 @@ def _no_language_model(folder: Path) -> None:
 @each("change, words", [
     (_without_template, r"no chat template.*set distill\.train\.chat_template"),
     (_without_end, r"no end token.*eos_token"),
-    (_remote_code, r"needs code of its own.*allow_code=true"),
+    (_remote_code, r"a model with its own code.*allow_code=true"),
     (_unknown_family, r"qwen99.*update transformers"),
     (_missing_weights, r"no weights for some of its layers.*o_proj.*download the whole model"),
     (_no_language_model, r"cannot be loaded.*ViTConfig.*use another student"),
@@ -177,7 +177,7 @@ def test_a_family_without_image_features_is_refused(place, built_once, tmp_path,
 
     folder = built_once("family_internvl", lambda root: make_family("internvl", root / "internvl")) / "internvl"
     monkeypatch.delattr(InternVLModel, "get_image_features")
-    with pytest.raises(InputError, match=r"encodes no pictures apart.*InternVL.*modalities=\[\]"):
+    with pytest.raises(InputError, match=r"get_image_features to encode pictures.*InternVL.*modalities=\[\]"):
         run(place, tmp_path / "out", folder, max_steps=1)
 
 
@@ -193,7 +193,7 @@ def test_a_head_that_scales_its_logits_is_refused(place, llama, tmp_path, monkey
         return found
 
     monkeypatch.setattr(LlamaForCausalLM, "forward", scaled)
-    with pytest.raises(ConfigError, match=r"changes its logits after the head.*LlamaForCausalLM"):
+    with pytest.raises(ConfigError, match=r"changes its logits after the output head.*LlamaForCausalLM"):
         run(place, tmp_path / "out", llama, max_steps=1)
 
 

@@ -120,7 +120,7 @@ def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
 
 
 def test_a_schema_is_enforced_by_servers_and_vllm_only(place, tmp_path):
-    with pytest.raises(ConfigError, match=r"cannot enforce a schema.*endpoint or vllm"):
+    with pytest.raises(ConfigError, match=r"cannot enforce a schema.*--engine endpoint or --engine vllm"):
         answer(place, tmp_path / "out", constrained=True)
 
 

@@ -67,7 +67,7 @@ def run(
     paths = [path / PREDICTIONS if path.is_dir() else path for path in predictions]
     files = {path.absolute().parent.name: path for path in paths}
     if len(files) < len(paths) or files.keys() & {TEACHER, *BASELINES}:
-        fix = "rename the folder of a student, which names its column"
+        fix = "rename a folder: each column has the name of the folder of a student"
         raise InputError("two columns of the table have the same name", got=", ".join(files), fix=fix)
     encoders = dict(encoders or {})
     inputs = {"dataset": dataset} | {f"judged/{n}": path for n, path in enumerate(judged, 1)}
@@ -82,7 +82,7 @@ def run(
     splits = sorted({p.split for own in found.values() for p in own.values()})
     if len(splits) != 1:
         fix = "pass predictions of one split"
-        raise InputError("the predictions are not of one split", got=", ".join(splits) or "none", fix=fix)
+        raise InputError("the predictions are not of one split", got=f"splits: {', '.join(splits) or 'none'}", fix=fix)
     samples, train, values = open_split(dataset, splits[0]), open_split(dataset, "train"), read_judged(judged)
     asked = asked_samples(samples, found)
     students: dict[str, StudentRecord] = {}
@@ -126,12 +126,12 @@ def asked_samples(samples: Sequence[Sample], predictions: Predictions) -> list[S
     keys = {sample.key for sample in samples}
     for name, own in predictions.items():
         if unknown := own.keys() - keys:
-            what = "the split does not contain the sample of a prediction"
-            fix = "pass the training set of the predictions"
-            raise InputError(what, where=f"{name}: {min(unknown)}", got=f"{len(unknown)} such predictions", fix=fix)
+            what = "the split of the training set does not contain this sample of the predictions"
+            fix = "pass the training set for which the predictions were made"
+            raise InputError(what, where=f"{name}: {min(unknown)}", got=f"{len(unknown)} such samples", fix=fix)
     asked = [sample for sample in samples if all(sample.key in own for own in predictions.values())]
     if not asked:
-        raise InputError("no sample was asked of all students", got=", ".join(predictions))
+        raise InputError("the students have no sample in common", got=f"predictions of {', '.join(predictions)}")
     return asked
 
 
@@ -213,7 +213,7 @@ class Scorer:
         import transformers
 
         if "t5" in str(folder) or str(folder).startswith("scibert"):
-            what = "bert-score takes every path with 't5' for a T5 model, and every 'scibert' for a download"
+            what = "bert-score mistakes a path with `t5` for a T5 model, and a path `scibert...` for a download"
             raise InputError(what, where=folder, fix="rename the folder")
         encoder_files(folder)
         try:

@@ -211,8 +211,8 @@ class LocalAnswers:
     def __init__(self, cfg: InferConfig, inputs: Inputs, book: AnswerBook, stop: str = "") -> None:
         """Load the student. stop: its answers end before this text."""
         if cfg.constrained:
-            words, fix = "the engine transformers cannot enforce a schema", "use the engine endpoint or vllm"
-            raise ConfigError(words, where=f"{STAGE}.constrained", fix=fix)
+            words, fix = "the engine `transformers` cannot enforce a schema", "pass --engine endpoint or --engine vllm"
+            raise ConfigError(words, where=f"{STAGE}.constrained", got="true", expected="false", fix=fix)
         if inputs.adapter is not None:
             check_adapter(inputs.adapter, Path(inputs.model))
         given: Any = {"device": cfg.device, "adapter": inputs.adapter, "allow_code": cfg.allow_code}
@@ -279,7 +279,7 @@ class LocalAnswers:
         except torch.OutOfMemoryError as error:
             if len(rows) == 1:
                 where, fix = f"{STAGE}.max_pixels", "lower max_pixels or max_new_tokens, and choose another --out"
-                raise ConfigError("the memory is full", where=where, got=str(error)[:120], fix=fix) from error
+                raise ConfigError("a sample exceeds the memory", where=where, got=str(error)[:120], fix=fix) from error
         torch.cuda.empty_cache()  # here, because the exception holds what it refers to
         half = len(rows) // 2
         return self._decode(rows[:half]) + self._decode(rows[half:])
@@ -389,7 +389,7 @@ def run(
     files: dict[str, Path] = {"dataset": dataset, **tree_inputs(trees.values())}
     if adapter is not None and cfg.engine != "transformers":
         fix = "merge the adapter into its model with cosfly distill merge, or pass --engine transformers"
-        words = "only the engine transformers can load an adapter"
+        words = "only the engine `transformers` can load an adapter"
         raise ConfigError(words, where=f"{STAGE}.engine", got=cfg.engine, fix=fix)
     if cfg.engine == "endpoint":
         cfg = _with_model_name(cfg, str(model), out)
@@ -403,8 +403,8 @@ def run(
         return out / PREDICTIONS
     samples = open_split(dataset, cfg.split)[: cfg.max_samples or None]
     if not samples:
-        fix = "pass --set distill.infer.split=val, or prepare more pedestrian trajectories"
-        raise InputError("the split is empty", where=dataset, got=cfg.split, fix=fix)
+        fix = "set distill.infer.split to another split, or prepare more pedestrian trajectories"
+        raise InputError("the split is empty", where=dataset, got=f"the split `{cfg.split}`", fix=fix)
     given = Inputs(samples, trees, model, adapter)
     start_s = time.monotonic()
     name = str(cfg.endpoint.model) if cfg.engine == "endpoint" else given.name

@@ -271,8 +271,8 @@ def run(
             left_out.update(reason for reason in found if isinstance(reason, str))
             own = [sample for sample in found if isinstance(sample, Sample)]
             if own and windows.setdefault(own[0].sample_id, own) is not own:
-                fix = "remove one of the two lines from the captions"
-                raise InputError("two captions are of the same window", where=own[0].sample_id, fix=fix)
+                fix = "remove one of the two lines"
+                raise InputError("the captions have two lines for this window", where=own[0].sample_id, fix=fix)
     if not windows:
         tally = Tally(input=left_out.total(), dropped=left_out)
         raise stage.nothing_kept(tally, expected="accepted captions with images below --data")

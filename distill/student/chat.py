@@ -142,10 +142,10 @@ class Processor:
     def check(self, where: Path) -> None:
         """Check what a student needs of its tokenizer."""
         if not self.chat_template:
-            fix = "set distill.train.chat_template to a file with the template of this family"
+            fix = "set distill.train.chat_template to a file with the template of this family of models"
             raise InputError("the tokenizer has no chat template", where=where, expected="chat_template.jinja", fix=fix)
         if self.end_token_id < 0:
-            words = "the tokenizer has no end token, and the chat template ends no answer with one"
+            words = "the tokenizer has no end token, and the chat template does not end an answer with one"
             raise InputError(words, where=where, fix='name an "eos_token" in tokenizer_config.json')
 
     def _content(self, content: str | list[dict[str, Any]]) -> Any:
@@ -188,7 +188,7 @@ class Processor:
         try:
             found = self._tokens(self.prompt_text(sample), size_px, len(sample.images))
         except ValueError as error:
-            fix = "remove the marks of pictures from the text of the prompt"
+            fix = "remove special tokens for pictures from the text of the prompt"
             raise InputError("the prompt cannot be encoded", where=sample.key, got=str(error)[:200], fix=fix) from error
         text = self.lead + sample.answer
         answer = self.tokenizer(text, add_special_tokens=False, return_offsets_mapping=self.tokenizer.is_fast)
@@ -253,7 +253,7 @@ def check_template(processor: Processor, sample: Sample) -> None:
         at = next((i for i, pair in enumerate(zip(taught, whole, strict=False)) if len(set(pair)) > 1), len(taught))
         got, expected = (f"{text[at : at + 40]!r} at character {at}" for text in (taught, whole))
         words = "the training text differs from that of the chat template"
-        raise InputError(words, where="student", got=got, expected=expected, fix="correct the template")
+        raise InputError(words, where="student", got=got, expected=expected, fix="correct the chat template")
 
 
 def padded(processor: Processor, rows: Sequence[EncodedSample]) -> dict[str, np.ndarray]:

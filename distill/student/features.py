@@ -127,7 +127,7 @@ def _encode_together(student: Student, pictures: Sequence[Tensors]) -> list[Tens
     import torch
 
     if not hasattr(student.core.base_model, "get_image_features"):
-        words, got = "the family of the student encodes no pictures apart", type(student.core).__name__
+        words, got = "the student has no method get_image_features to encode pictures", type(student.core).__name__
         fix = "use another student, or a training set without pictures (distill.prepare.modalities=[])"
         raise InputError(words, where="get_image_features", got=got, fix=fix)
     inputs = {name: torch.cat([one[name] for one in pictures]).to(student.device) for name in pictures[0]}

@@ -149,7 +149,7 @@ def loading_errors(what: str, where: Path) -> Iterator[None]:
         got = " ".join(str(error).split())[:300] or type(error).__name__
         fix = "update transformers, or use another student"
         if "trust_remote_code" in str(error):
-            got, fix = "it needs code of its own", "set allow_code=true if you trust this code, or use another student"
+            got, fix = "a model with its own code", "set allow_code=true if you trust this code, or use another student"
         elif where.suffix == GGUF:
             fix = "use a file of another quantization, such as Q8_0 or F16"
         raise InputError(f"the {what} cannot be loaded", where=where, got=got, fix=fix) from error
@@ -256,7 +256,7 @@ def load_student(
             num_wanted = sum("lora_" in name for name, _ in model.named_parameters())
             if num_found != num_wanted:  # the library leaves a missing tensor at zero, and ignores one too many
                 got, fix = f"{num_found} tensors", "pass the base model of this adapter, or the whole adapter"
-                words, expected = "the adapter does not fit the model", str(num_wanted)
+                words, expected = "the adapter does not fit the model", f"{num_wanted} tensors"
                 raise InputError(words, where=adapter, got=got, expected=expected, fix=fix)
     model.to(device_name)
     if is_fast and device_name == "cuda":

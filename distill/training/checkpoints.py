@@ -80,9 +80,9 @@ def load_checkpoint(folder: Path, student: Student, optimizer: Any = None) -> Pr
         found = load_file(folder / WEIGHTS)
         kept_moments = load_file(folder / MOMENTS) if optimizer is not None else {}
         if found.keys() != weights.keys():
-            raise ValueError("its weights are those of another student")
+            raise ValueError("the weights are those of another student")
     except (SafetensorError, OSError, ValueError) as error:
-        fix = f"remove {folder}, then run the same command again: it resumes from the checkpoint before"
+        fix = f"remove {folder}, then run the same command again to resume from the previous checkpoint"
         raise InputError("the checkpoint is damaged", where=folder, got=str(error)[:200], fix=fix) from error
     with torch.no_grad():
         for name, parameter in weights.items():

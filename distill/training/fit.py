@@ -157,7 +157,7 @@ def train_step(
             parameter.grad /= weight
     norm = float(torch.nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM))
     if not math.isfinite(total) or not math.isfinite(norm):
-        words, got = "the loss or its gradient is not finite", f"{cfg.learning_rate}"
+        words, got = "the loss or the gradient became infinite or NaN", f"{cfg.learning_rate}"
         fix = "lower learning_rate and choose another --out; the last checkpoint is still usable"
         raise ConfigError(words, where="learning_rate", got=got, fix=fix)
     for group in optimizer.param_groups:
@@ -180,12 +180,12 @@ def fit(context: TrainingContext, out: Path) -> Progress:
     used = sha256_bytes(dump_json(places).encode())  # the order of the steps depends on the samples that are used
     if len(set(gather_object([used]))) > 1:
         fix = "check that all processes can read the same pictures, then run the same command again"
-        raise InputError("the processes can use different samples", where=STAGE, fix=fix)
+        raise InputError("the processes of this training find different samples", where=STAGE, fix=fix)
     optimizer, newest = make_optimizer(student, cfg), newest_checkpoint(folder)
     progress = load_checkpoint(newest, student, optimizer) if newest else Progress(samples=used)
     if progress.samples != used:
         fix = "restore the pictures as they were, or choose another --out"
-        raise ResumeError("other samples can be used than when the training began", where=out, fix=fix)
+        raise ResumeError("the usable samples have changed since the training began", where=out, fix=fix)
     words = f"resumed after step {progress.step}" if newest else "no checkpoint yet: begins with the first step"
     log.info("%s: %s", STAGE, words)
     if accelerator.is_main_process:

@@ -98,11 +98,11 @@ def check_head(student: Student) -> None:
     head, ids = student.core.get_output_embeddings(), torch.full((1, 4), student.end_token_id, device=student.device)
     if type(head) is not torch.nn.Linear or head.bias is not None:
         got = type(head).__name__
-        raise ConfigError("the output head is no plain matrix", where="student", got=got, fix="use another student")
+        raise ConfigError("the head is not a plain linear layer", where="student", got=got, fix="use another student")
     with torch.no_grad(), student.computing():
         logits = student.core(input_ids=ids, use_cache=False).logits.float()
         hidden = student.core.base_model(input_ids=ids, use_cache=False).last_hidden_state
         plain = (hidden.to(student.dtype) @ head.weight.to(student.dtype).T).float()
     if not torch.allclose(logits, plain, rtol=0.05, atol=0.05 * float(logits.abs().max())):
-        words, got = "the student changes its logits after the head, which the loss lacks", type(student.core).__name__
-        raise ConfigError(words, where="student", got=got, fix="use another student")
+        words = "the loss cannot be computed, because the student changes its logits after the output head"
+        raise ConfigError(words, where="student", got=type(student.core).__name__, fix="use another student")

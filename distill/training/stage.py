@@ -48,7 +48,8 @@ def taught_by(samples: Sequence[Sample], max_pixels: int) -> ChatFormat:
     """
     lengths = {len(sample.frames) for sample in samples}
     if len(lengths) != 1:
-        raise InputError("the training set has windows of different lengths", got=f"{sorted(lengths)} frames")
+        fix = "prepare the training set from captions with the same caption.window.num_frames"
+        raise InputError("the training set has windows of different lengths", got=f"{sorted(lengths)} frames", fix=fix)
     looks = {FrameFormat(views=s.views, size_px=s.picture_px, depth_range_m=s.depth_range_m) for s in samples}
     prompts = {sample.language: sample.prompt for sample in reversed(samples)}  # the first of each language
     return ChatFormat(
@@ -162,12 +163,12 @@ def torch_errors(cfg: TrainConfig) -> Iterator[None]:
         if isinstance(error, torch.OutOfMemoryError | MemoryError) or "DefaultCPUAllocator" in text:
             fix = "lower batch_size or max_tokens, or set gradient_checkpointing=true; then " + again
             got = f"batch_size {cfg.batch_size}: {got}"
-            raise ConfigError("the memory is full", where=f"{STAGE}.batch_size", got=got, fix=fix) from error
+            raise ConfigError("a batch needs too much memory", where=f"{STAGE}.batch_size", got=got, fix=fix) from error
         if "DataLoader worker" in text:
             fix = f"{again}; if memory (or --shm-size) is short, lower {STAGE}.data_workers"
             raise EnvironmentMissing("the system killed a process that reads samples", got=got, fix=fix) from error
         if isinstance(error, torch.distributed.DistError) or "gloo" in text or "Connection" in text:
-            fix = f"read the message of that process, then {again}"
+            fix = f"read the last message of the other process, then {again}"
             raise EnvironmentMissing("another process of this training has ended", got=got, fix=fix) from error
         raise
 
@@ -257,7 +258,7 @@ def _context(
     student = prepared_student(cfg, base, seed, pick_device(cfg.device))
     samples, validation = (open_split(dataset, split, text_only=not student.has_pictures) for split in ("train", "val"))
     if not samples:
-        fix = "prepare the training set with more captions, or with other fractions"
+        fix = "prepare the training set with more captions, or with lower val_fraction and test_fraction"
         raise InputError("the training split is empty", where=dataset, fix=fix)
     if trees and not student.has_pictures:
         log.warning("%s: the student takes no pictures: it is taught with the text state alone", STAGE)
@@ -276,9 +277,9 @@ def _context(
         num_answer = sum(len(sample.row.answer_ids) for sample in split.used)
         log.info(words, STAGE, name, len(split.used), split.lengths.sum(), num_answer)
         for reason, found in sorted(split.skipped.items()):
-            words = "%s: %d samples of %s are skipped as %s; the first: %s"
-            log.warning(words, STAGE, len(found), name, reason, found[0])
+            note = "%s: %d samples of %s are skipped as %s; the first: %s"
+            log.warning(note, STAGE, len(found), name, reason, found[0])
     if not train.used:
         words, got = "no sample can be used for training", ", ".join(train.skipped)
-        raise InputError(words, where=dataset, got=got, fix="read the warnings above, and change the settings")
+        raise InputError(words, where=dataset, got=got, fix="change the settings that cause the warnings above")
     return context, taught
