@@ -54,6 +54,7 @@ NEAR_M = 0.3  # the renderers' near plane
 MOST_FRAMES = 10_000_000  # of a track
 LEAST_ZOOMED = 3  # rows whose camera is not that of most rows
 LARGEST = 1e9  # of a value: beyond any town, track and picture
+REBUILD = "download the release again, or build it again"
 
 
 def vectors(rows: Sequence[Row], name: str, members: tuple[str, ...]) -> np.ndarray:
@@ -282,14 +283,14 @@ def read_tracks(
     for place, frames in both[0]:
         own, of_points = next(points, (None, ()))
         if own != place:
-            got = "no track" if own is None else track_name(own)
-            what = "the points of a shard are not those of its tracks"
-            raise InputError(what, where=folder / shard.points.path, got=got, expected=track_name(place))
+            got = "no further points" if own is None else f"points of {track_name(own)}"
+            what, expected = "the tracks of this file are not those of the frames", f"points of {track_name(place)}"
+            raise InputError(what, where=folder / shard.points.path, got=got, expected=expected, fix=REBUILD)
         name = track_name(place)
         yield TrackRows(name, list(frames)), TrackRows(name, list(of_points))
     if (more := next(points, None)) is not None:
-        what = "the points of a shard are not those of its tracks"
-        raise InputError(what, where=folder / shard.points.path, got=track_name(more[0]), expected="no further track")
+        what, got = "the tracks of this file are not those of the frames", f"points of {track_name(more[0])}"
+        raise InputError(what, where=folder / shard.points.path, got=got, expected="no further points", fix=REBUILD)
 
 
 def read_pictures(folder: Path, shard: Shard, files: Sequence[FrameFile]) -> Iterator[Pictures]:

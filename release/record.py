@@ -254,7 +254,7 @@ class ReleaseRecord(Strict):
         if self.settings.selection == "stride" and any(one.frames < one.frames_available for one in self.flights):
             raise InputError(
                 f"{what} needs consecutive frames, which this release does not have", where=where,
-                got=f"a uniform stride of {self.settings.num_frames} frames per track",
+                got=f"{self.settings.num_frames} frames of each track, chosen with a stride",
                 fix="build another release of the run with --set release.selection=windows",
             )  # fmt: skip
 

@@ -302,7 +302,7 @@ def test_an_export_that_fails_publishes_nothing(broken, tmp_path, change, words)
 @each(("format", "name"), itertools.product(EXPORTS, ["../../escaped", "trajectory_1"]))
 def test_a_sample_id_is_a_file_name_of_one_frame(broken, tmp_path, format, name):
     rewrite(broken, lambda rows: [row.update(sample_id=name) for row in rows[3:5]])
-    with pytest.raises(InputError, match="the sample_id of a frame is repeated or is not a file name"):
+    with pytest.raises(InputError, match="the sample_id of a frame is repeated or is not a valid file name"):
         export(config(format), broken, tmp_path / "out")
     assert not (tmp_path / "out" / format).exists()
 

@@ -41,7 +41,7 @@ class TrackCaptions:
         if caption.status != "accepted":
             self.dropped.setdefault(frame, caption.drop_reason or NO_REASON)
         elif frame in self.spans:
-            raise InputError("the frame has two accepted captions")
+            raise InputError("the frame has two accepted captions", fix="remove one of the two lines")
         else:
             self.spans[frame] = span
 
@@ -123,8 +123,8 @@ def _check(caption: Caption, *, is_known: bool) -> None:
             fix="pass the captions that were made from this tree",
         )  # fmt: skip
     if not caption.sample_id.endswith(sample_id(f"{caption.trajectory}_{caption.variant}", caption.frame_index)):
-        got = f"frame {caption.frame_index}"
+        got = f"{caption.sample_id} for frame {caption.frame_index}"
         raise InputError("the sample_id of the caption does not match its frame", got=got)
     if caption.status == "accepted" and (caption.en is None or caption.zh is None):
-        fix = "caption the tree in both languages, which a release needs"
+        fix = "caption the tree in English and Chinese, which a release needs"
         raise InputError("the accepted caption lacks a language", fix=fix)

@@ -175,7 +175,7 @@ def _check_sizes(tracks: list[Chosen]) -> None:
         groups["{} x {} px".format(*track.size_px)].append(track.name)
     if len(groups) > 1:
         got = "; ".join(f"{size}: {len(names)} tracks, such as {names[0]}" for size, names in sorted(groups.items()))
-        what, expected = "the tracks differ in the size of pictures", "one size for all tracks of a release"
+        what, expected = "the tracks differ in the size of pictures", "one size in all tracks of a release"
         raise InputError(what, got=got, expected=expected)
 
 
@@ -186,7 +186,7 @@ def _index_captions(sources: list[Source], material: Material, tracks: list[Chos
         released = dict[FlightKey, TrackCaptions]()
         for track in (track for track in tracks if track.candidate.source == number):
             if track.candidate.key in released:
-                what, fix = "the captions fit several tracks of the tree", "release the trees of the runs separately"
+                what, fix = "several runs of the tree have the track of this caption", "build a release of each run"
                 raise InputError(what, where=source.captions, got="/".join(track.candidate.key), fix=fix)
             released[track.candidate.key] = track.captions
         others = {one.key for one in material.candidates if one.source == number} - released.keys()

@@ -210,5 +210,5 @@ def _check_digest(folder: Path, name: str, data: bytes | None, digests: Mapping[
     got = sha256_file(folder / name) if data is None else hashlib.sha256(data).hexdigest()
     if got != digests.get(name):
         expected = digests.get(name, "a recorded digest")
-        what = "the file differs from the recorded digest"
+        what = "the file has changed since its digest was recorded"
         raise VerifyError(what, where=folder / name, got=got, expected=expected, fix=RESTORE)

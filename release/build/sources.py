@@ -195,7 +195,7 @@ def choose_licence(licence: str | None, maps: list[tuple[str, str]]) -> str:
     chosen = licence or maps[0][1]
     if chosen == UNKNOWN_LICENCE or (licence is None and len({one for _, one in maps}) > 1):
         raise ConfigError(
-            "the licence of the release is unknown", where="release.licence",
+            "the maps state no licence, or different ones", where="release.licence",
             got=", ".join(f"{name}: {one}" for name, one in maps),
             expected="a licence identifier of the Hugging Face Hub",
             fix="pass --set release.licence=LICENCE, such as cc-by-4.0 or apache-2.0",

@@ -218,8 +218,8 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
     for name, own in shards(episodes(), cfg.shard_mb):
         first = next(own)
         if cfg.video and any(side % 2 for side in first.size_px):
-            got = "{} x {} px".format(*first.size_px)
-            raise InputError("video needs pictures of even width and height", where=source.folder, got=got)
+            got, fix = "{} x {} px".format(*first.size_px), "export without --video"
+            raise InputError("--video needs pictures of even width and height", where=source.folder, got=got, fix=fix)
         features = features or features_of(source.modalities, first.size_px, fps, cfg.video)
         if not layout.file:
             layout = replace(layout, size_px=first.size_px)
@@ -256,7 +256,7 @@ def _fps(record: ReleaseRecord) -> int:
     whole_s = (duration.mean or 0.0) * duration.count
     fps = round(num_steps / whole_s) if whole_s > STEP_TOLERANCE_S else 0 if steps_s else PAPER_FPS
     if any(abs(step - 1 / (fps or 1)) > STEP_TOLERANCE_S for step in steps_s):
-        what = "LeRobot needs the same whole number of frames per second in all tracks"
+        what = "LeRobot needs a whole number of frames per second, the same in all tracks"
         raise InputError(what, where="time_s", got=f"steps of {', '.join(map(str, sorted(steps_s)[:10]))} s")
     return fps
 

@@ -128,10 +128,10 @@ class SourceTrack:
         if file == "depth":
             size = parse_array(data, where, dtype=np.float32, ndim=2, what="depth image", copy=False).shape[::-1]
         if size is None:
-            raise InputError("the frame has no picture", where=where, got="data that are not a PNG")
+            raise InputError("the picture of the frame is not a PNG file", where=where)
         if size != self.size_px:
             got, expected = ("{} x {} px".format(*one) for one in (size, self.size_px))
-            raise InputError("the picture has another size than its track", where=where, got=got, expected=expected)
+            raise InputError("the picture has another size than the track", where=where, got=got, expected=expected)
         return data
 
 
@@ -158,12 +158,12 @@ class ExportSource:
                 parts = [frames.rows[0][name] for name in PLACE]
                 place = Place(*parts)
                 if not all(map(PART.fullmatch, parts)) or place in known:
-                    what = "the names of the track are not folder names, or it is in two places"
+                    what = "the names of a track are not valid folder names, or the track occurs twice"
                     raise InputError(what, where=path, got=shown(parts, 200))
                 known.add(place)
                 ids = frames.column("sample_id")
                 if not all(map(PART.fullmatch, ids)) or len({*ids}) < len(ids):
-                    what = "the sample_id of a frame is repeated or is not a file name"
+                    what = "the sample_id of a frame is repeated or is not a valid file name"
                     raise InputError(what, where=frames.name, got=shown(ids, 200))
                 for name in ("width_px", "height_px"):
                     if len({*frames.column(name)}) > 1:
@@ -245,11 +245,11 @@ def check_needs(source: ExportSource, cfg: ExportConfig) -> ExportSource:
     chosen = cfg.modalities or tuple(file for file in export.default if file in source.modalities)
     for needed in (*export.pictures, *chosen):
         if needed not in source.modalities:
-            got = f"pictures: {', '.join(source.modalities)}"
-            raise InputError(f"the {cfg.format} export needs {needed} pictures", where=source.folder, got=got)
+            got, fix = f"a release with {', '.join(source.modalities)}", f"build a release with {needed} pictures"
+            raise InputError(f"the {cfg.format} export needs {needed} pictures", where=source.folder, got=got, fix=fix)
     if unused := set(chosen) - set(export.carries):
-        what = f"the {cfg.format} export holds no {' and no '.join(sorted(unused))} pictures"
-        raise InputError(what, where="--modalities", expected=", ".join(export.carries))
+        what = f"the {cfg.format} export cannot contain {' or '.join(sorted(unused))} pictures"
+        raise InputError(what, where="--modalities", expected=f"some of {', '.join(export.carries)}")
     return replace(source, modalities=chosen, files=tuple(dict.fromkeys((*chosen, *export.pictures))))
 
 

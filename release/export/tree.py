@@ -43,8 +43,8 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
     for track in source.tracks():
         at = track.place
         if not at.town.startswith(TOWN) or not at.trajectory.startswith("trajectory_"):
-            what, expected = "the track cannot be written as a playback tree", f"{TOWN}*/trajectory_*"
-            raise InputError(what, where=source.folder, got=track.name, expected=expected)
+            what, expected = "a playback tree cannot contain a track of this name", f"{TOWN}*/trajectory_*"
+            raise InputError(what, where=source.folder, got=track.name, expected=expected, fix="export another format")
         group = (at.run, at.town, at.trajectory)
         groups[group] += 1
         number, place = list(groups).index(group), folder / (at.run if has_runs else "") / at.town
