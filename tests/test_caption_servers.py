@@ -146,7 +146,7 @@ FAULTS: dict[str, tuple] = {
     "nobody: headers that never end": (raw(HEAD, b"X: y\r\n", pause_s=0.02, is_endless=True), silent("timeout",
         "within 3 s"), IMPATIENT),
     "nobody: a byte now and then": (raw(HEAD + b"Content-Length: 9999\r\n\r\n", b" ", pause_s=0.02, is_endless=True),
-        silent("timeout", "within 3 s"), IMPATIENT),
+        silent("timeout", "raise the time limit, such as caption.endpoint.timeout_s=6"), IMPATIENT),
 }  # fmt: skip
 
 
@@ -271,10 +271,12 @@ def test_thoughts_that_use_up_all_tokens_are_an_answer_that_was_cut(tree, tmp_pa
 
 
 def test_prompts_that_a_server_cuts_in_silence_are_reported(tmp_path, caplog):
+    caplog.set_level("INFO")
     tree = make_playback_tree(tmp_path / "tree", 1, 24, with_augmented=False)
     with deciding() as server:  # counts 1,000 tokens for every prompt
         run(settings(server.url, limit=15), tree, tmp_path / "out")
     assert "all count 1000 tokens" in caplog.text
+    assert caplog.text.count("the first request is sent; an answer may take up to 60 s") == 1
 
 
 @each(("step", "is_cut"), [(2, False), (10, True)])
@@ -456,6 +458,18 @@ def test_a_defect_is_found(defect, name, state, words):
     findings = examine(patient(**defect), defect.get("context", CONTEXT))
     assert findings[name].state == state
     assert words in findings[name].detail
+
+
+def test_a_slow_answer_to_the_largest_prompt_is_no_matter_of_the_context():
+    slow = raw(HEAD, b"X: y\r\n", pause_s=0.02, is_endless=True)
+    sound = patient()
+    findings = examine(
+        lambda body: (slow if body["messages"][0]["role"] == "system" else sound)(body),
+        image={"modalities": []}, endpoint={"timeout_s": IMPATIENT["timeout_s"]},
+    )  # fmt: skip
+    assert list(findings) == ["model", "answers", "thinking", "JSON schema", "speed"]
+    assert findings["speed"].state == "unusable"
+    assert "caption.endpoint.timeout_s=6" in findings["speed"].detail
 
 
 def test_an_examination_without_pictures():

@@ -125,13 +125,15 @@ class _Examination:
         self.advance(1, f"{self.num_requests} requests sent")
 
     async def _answers(self) -> bool:
+        start_s = time.monotonic()
         reply = await self._ask([_user(READY)], self.cfg.endpoint.max_tokens)
+        seconds = time.monotonic() - start_s
         problem = reply if isinstance(reply, str) else _problem_of(reply)
         if isinstance(reply, str) or problem is not None:
             self._add("answers", "unusable", problem or "")
             return False
         text = reply.text.strip()
-        self._add("answers", "ok", f"{text[:40]!r}")
+        self._add("answers", "ok", f"{text[:40]!r} after {seconds:.1f} s")
         is_off = not reply.num_thoughts and "<think" not in text
         fix = f"the model thinks before it answers; switch thinking off with {NO_THINKING}"
         self._add("thinking", "ok" if is_off else "warning", "off" if is_off else fix)
@@ -169,7 +171,7 @@ class _Examination:
             without = _prompt_tokens(await self._ask([_user(READY)], limit))
             tokens = None if without is None else num_tokens - without
         if isinstance(reply, str):
-            self._add("image input", "unusable", f"a prompt with {len(pictures)} pictures is refused: {reply}")
+            self._add("image input", "unusable", f"a prompt with {len(pictures)} pictures gets no answer: {reply}")
         elif tokens is None:
             detail = "but it is unknown whether the model sees them, because token usage is not reported"
             self._add("image input", "warning", f"{count} are accepted, {detail}")
@@ -187,7 +189,8 @@ class _Examination:
         reply = await self._ask(self.largest, limit, answer_schema(more=THEREFORE))
         seconds = time.monotonic() - start_s
         if isinstance(reply, str):
-            self._add("context length", "unusable", f"the largest prompt is refused: {reply}")
+            name = "speed" if seconds >= self.cfg.endpoint.timeout_s else "context length"
+            self._add(name, "unusable", f"the largest prompt gets no answer: {reply}")
             return
         used, known = _prompt_tokens(reply), f" of the context of {context}" if context else ""
         detail = f"{used or 'unknown'} tokens of the largest prompt and {limit} for the answer"

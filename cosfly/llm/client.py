@@ -197,6 +197,8 @@ class ChatClient:
 
     async def _try(self, request: Request, sent_s: float) -> Reply:
         """Try once to get the answer of a request; NoAnswer fails this try, TeacherError all requests."""
+        first = f"the first request is sent; an answer may take up to {self.cfg.timeout_s:g} s (endpoint.timeout_s)"
+        self._tell_once("sent", logging.INFO, first)
         try:
             reply = await self.ask(request)
         except (TimeoutError, httpx.RequestError) as error:  # also a compressed body
@@ -357,7 +359,9 @@ class ChatClient:
     def message_of(self, error: Exception) -> str:
         """Return the message of an exchange that failed."""
         if isinstance(error, TimeoutError | httpx.TimeoutException):
-            return f"no answer within {self.cfg.timeout_s:g} s; raise the limit, such as caption.endpoint.timeout_s=600"
+            limit_s = self.cfg.timeout_s
+            fix = f"raise the time limit, such as caption.endpoint.timeout_s={2 * limit_s:g}"
+            return f"no answer within {limit_s:g} s; {fix}, or use a faster server, a smaller model or shorter prompts"
         return self._clean(f"{type(error).__name__} {error}")
 
     def _clean(self, text: str) -> str:
