@@ -112,6 +112,22 @@ def test_people_walk_where_the_settings_say(ground, columns):
     assert not found.parts[:, columns:].any()
 
 
+def test_walkable_ground_in_small_areas_is_left_out_and_counted(caplog):
+    caplog.set_level("INFO")
+    # Pavement of 100 m by 100 m, and 50 m away a square of 20 m and one of 10 m.
+    box_map = make_box_map(
+        [[50, 50, -0.1], [160, 50, -0.1], [160, 90, -0.1]], [[50, 50, 0.1], [10, 10, 0.1], [5, 5, 0.1]],
+        np.zeros((3, 3)), [KINDS["Sidewalks"]] * 3,
+    )  # fmt: skip
+    found = walkable_ground(box_map, PedestriansConfig(safety_radius_m=0))
+    assert np.count_nonzero(found.parts) == 200 * 200
+    assert "2000 walkable cells (500 m2) are not used" in caplog.text
+    assert "pedestrians.min_component_cells=4000 connected cells (number of areas: 2)" in caplog.text
+    caplog.clear()
+    assert np.count_nonzero(walkable_ground(box_map, PedestriansConfig(safety_radius_m=0, min_component_cells=1)).parts)
+    assert "are not used" not in caplog.text
+
+
 @pytest.mark.parametrize(("number", "dt_s"), [*((k, DT_S) for k in range(6)), (6, 0.2), (7, 2.0)])
 def test_a_walk_keeps_every_promise(number, dt_s):
     cfg = PedestriansConfig(dt_s=dt_s)
