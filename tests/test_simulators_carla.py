@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from commands import invoke
 from simulator_serving import AS_FOUND, as_client, carla_settings, command, free_port, serving
-from simulators.carla_server import depth_picture
+from simulators.carla_server import DEPTH_STEP_M, depth_picture
 from simulators.scene import clothes_of
 from test_renderers_contract import circling, street, write_inputs
 
@@ -34,7 +34,7 @@ from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, RenderError
-from cosfly.simulators.conventions import DEPTH_STEP_M, camera_rotation_deg, depth_of, unreal_pose, world_pose
+from cosfly.simulators.conventions import camera_rotation_deg, depth_of, unreal_pose, world_pose
 
 pytest.importorskip("carla")
 

@@ -24,6 +24,7 @@ from cosfly.formats.traces import DroneTrace, write_traces
 from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, PlanConfig, known_planner, planner_notes, title_of
 from cosfly.planners.overview import draw_compared
 from cosfly.planners.stage import load_obstacles, make_items, plan_trajectory, read_inputs, warm_up
+from cosfly.runtime.config import Distinct
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, read_object, write_json
@@ -194,13 +195,11 @@ def finite(figures: dict[str, float]) -> dict[str, float | None]:
 class CompareConfig(PlanConfig):
     """Settings of a comparison: those of step 4, of which `planner` is ignored, and the planners to compare."""
 
-    planners: tuple[str, ...] = Field(tuple(PLANNERS), description="planners to compare with the first one")
+    planners: Distinct[tuple[str, ...]] = Field(tuple(PLANNERS), description="planners to compare with the first one")
 
     @field_validator("planners")
     @classmethod
     def _are_known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        if len(set(names)) < len(names):
-            raise ValueError("each planner may be listed only once")
         for name in names:
             known_planner(name)
         if len(names) < 2:

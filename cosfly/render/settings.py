@@ -13,6 +13,7 @@ from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.perturbation import PerturbationConfig
 from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
 from cosfly.render.weather import WeatherConfig
+from cosfly.runtime.config import Distinct
 from cosfly.runtime.png import LONGEST_SIDE_PX
 
 SIMULATORS = ("carla", "unrealcv")
@@ -48,12 +49,12 @@ class RenderConfig(WeatherConfig):
         description="trajectory k of the traces becomes trajectory_<first_timestamp + k>; null derives it from map, "
         "traces, seed and settings, so that other maps and runs have other ids",
     )
-    tracks: tuple[Literal["clean", "perturbed"], ...] = Field(
+    tracks: Distinct[tuple[Literal["clean", "perturbed"], ...]] = Field(
         ("clean", "perturbed"), min_length=1, description="tracks to draw: clean (ORI) and perturbed (aug_001)"
     )
     perturbation: PerturbationConfig = Field(PerturbationConfig(), description="the perturbed track")
     look: Look = Field(Look(), description="sun and air of trajectories without weather")
-    modalities: tuple[FrameFile, ...] = Field(
+    modalities: Distinct[tuple[FrameFile, ...]] = Field(
         ("rgb", "depth", "instance"), min_length=1, description="images to write; meta.json is always written"
     )
     depth_format: DepthFormat = Field(
@@ -102,13 +103,6 @@ class RenderConfig(WeatherConfig):
             fix = "remove render.look (--set 'render.look={}'), or set render.weather_mode to off"
             raise ValueError(f"render.look cannot be combined with render.weather_mode {self.weather_mode}; {fix}")
         return self
-
-    @field_validator("tracks", "modalities")
-    @classmethod
-    def _each_once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        if len(set(names)) != len(names):
-            raise ValueError("each name may be listed only once")
-        return names
 
     @field_validator("town")
     @classmethod

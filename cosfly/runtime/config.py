@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from pydantic_core import to_jsonable_python
 
 from cosfly.runtime.errors import ConfigError, InputError, json_type, nearest, plain, shown
@@ -36,6 +36,15 @@ MayDiffer = Annotated[T, _MAY_DIFFER]
 # IfChanged[int] is recorded only if it is not the default, so that products made without the setting stay the same.
 _IF_CHANGED = "recorded if changed"
 IfChanged = Annotated[T, _IF_CHANGED]
+
+
+def _each_once(values: tuple[T, ...]) -> tuple[T, ...]:
+    if len(set(values)) < len(values):
+        raise ValueError("each entry may be listed only once")
+    return values
+
+
+Distinct = Annotated[T, AfterValidator(_each_once)]  # Distinct[tuple[str, ...]] may not list an entry twice
 
 
 class Config(BaseModel):

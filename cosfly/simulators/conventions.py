@@ -13,11 +13,9 @@ import numpy as np
 
 from cosfly.geometry.axes import BODY_FROM_CAMERA, mirror_poses
 
-CARLA_VERSION = "0.9.16"
 SIMULATED_STEP_S = 0.05  # time step of synchronous mode (sec:step5)
 DEPTH_RANGE_M = 1000.0
 DEPTH_STEPS = 2**24 - 1
-DEPTH_STEP_M = DEPTH_RANGE_M / DEPTH_STEPS
 ACTOR_BITS = 0xFFFF  # the bits of an actor's number that pictures hold
 CM_PER_M = 100.0
 FAR_CM = 65504.0  # the largest half-precision number: UnrealCV's depth of the sky and of all beyond

@@ -28,7 +28,7 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.splits import SPLITS, Course, assign_splits, town_family, walks_of
 from cosfly.inspection.blind_baseline import past_of
 from cosfly.llm.answer_text import parse_answer
-from cosfly.runtime.config import Config
+from cosfly.runtime.config import Config, Distinct
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import check_stays_below, inside
@@ -117,13 +117,13 @@ class SplitConfig(Config):
 class PrepareConfig(SplitConfig):
     """Settings of `distill prepare`."""
 
-    languages: tuple[Language, ...] = Field(
+    languages: Distinct[tuple[Language, ...]] = Field(
         ("en", "zh"), min_length=1, description="languages of the answers; each gives its own samples"
     )
     decision: Place = Field(
         "first", description="place of the decision among the fields of an answer; a student answers in this order"
     )
-    modalities: tuple[View, ...] = Field(
+    modalities: Distinct[tuple[View, ...]] = Field(
         ("rgb",),
         description="pictures of each frame, in this order; middle: the middle third of rgb; empty: only text",
     )
@@ -137,8 +137,6 @@ class PrepareConfig(SplitConfig):
     def _there_is_something_to_learn(self) -> PrepareConfig:
         if not self.modalities and not self.text_state:
             raise ValueError("modalities must not be empty if text_state is false")
-        if len(set(self.languages)) < len(self.languages) or len(set(self.modalities)) < len(self.modalities):
-            raise ValueError("languages and modalities must not repeat an entry")
         return self
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from cosfly.formats.boxes import LicenceId
 from cosfly.formats.frames import FILE_NAMES, FrameFile
 from cosfly.formats.places import TrackName
-from cosfly.runtime.config import Config
+from cosfly.runtime.config import Config, Distinct
 from release.columns import SplitName
 from release.record import Pairs, Selection, SplitBy
 
@@ -35,7 +35,7 @@ class ReleaseConfig(Config):
         (),
         description="patterns of track folders, such as Town01/trajectory_17*/ORI; empty: all",
     )
-    tracks: tuple[TrackName, ...] = Field(
+    tracks: Distinct[tuple[TrackName, ...]] = Field(
         ("clean", "perturbed"), min_length=1, description="tracks of a trajectory to release"
     )
     pairs: Pairs = Field(
@@ -53,7 +53,7 @@ class ReleaseConfig(Config):
         0.1, ge=0, lt=1, description="share of pedestrian trajectories (or towns) for the test; 0: none"
     )
     split_seed: ClassVar[int] = 0  # of the division into splits
-    modalities: tuple[FrameFile, ...] = Field(
+    modalities: Distinct[tuple[FrameFile, ...]] = Field(
         tuple(FILE_NAMES), min_length=1, description="pictures to include: rgb, depth, instance"
     )
     shard_mb: int = Field(
@@ -64,13 +64,6 @@ class ReleaseConfig(Config):
     row_group_mb: int = Field(
         64, ge=1, le=1024, description="size of a row group before compression, MB; viewers load one at a time"
     )
-
-    @field_validator("tracks", "modalities")
-    @classmethod
-    def _distinct(cls, values: tuple) -> tuple:
-        if len(set(values)) != len(values):
-            raise ValueError("each entry may occur only once")
-        return values
 
     @model_validator(mode="after")
     def _fractions_leave_something(self) -> ReleaseConfig:

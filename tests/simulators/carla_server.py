@@ -13,9 +13,11 @@ import numpy as np
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.bystanders import BUILDS
 from cosfly.formats.weather import WeatherParams
-from cosfly.simulators.conventions import CARLA_VERSION, DEPTH_RANGE_M, DEPTH_STEPS, SIMULATED_STEP_S, unreal_pose
+from cosfly.simulators.conventions import DEPTH_RANGE_M, DEPTH_STEPS, SIMULATED_STEP_S, unreal_pose
 from simulators.scene import Mover, Server, listen, send
 
+CARLA_VERSION = "0.9.16"
+DEPTH_STEP_M = DEPTH_RANGE_M / DEPTH_STEPS
 EPISODE_STREAM, EPISODE_OBSERVER = 1, 17  # the stream of the world's state, and its number as a sensor
 FIRST_ACTOR = 201  # an actor's number is that of its stream too
 BYTES_AFTER_POSE = 90  # of an actor's state: its motion, and what depends on its kind
