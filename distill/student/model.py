@@ -206,7 +206,7 @@ def load_student(
     """
     require("torch", "transformers", "peft")
     weight_files(path)
-    log.info("loading the student %s", path)
+    log.info("loading the student %s%s", path, ", a GGUF file: this may take minutes" * (path.suffix == GGUF))
     import torch
     from peft import PeftModel, load_peft_weights
     from transformers import AutoConfig, AutoModelForCausalLM, AutoModelForImageTextToText, AutoTokenizer
@@ -215,12 +215,10 @@ def load_student(
     quiet_transformers()
     device_name = pick_device(device)
     computed = compute_dtype(dtype, device_name)
-    arguments: dict[str, Any] = {"local_files_only": True, "trust_remote_code": allow_code}
+    arguments: Any = {"pretrained_model_name_or_path": path, "local_files_only": True, "trust_remote_code": allow_code}
     if path.suffix == GGUF:
         require("gguf")
         arguments |= {"pretrained_model_name_or_path": path.parent, "gguf_file": path.name}
-    else:
-        arguments["pretrained_model_name_or_path"] = path
     with loading_errors("configuration of the student", path):
         config = AutoConfig.from_pretrained(**arguments)
     stored = None if path.suffix == GGUF else getattr(config, "dtype", None)
@@ -239,7 +237,7 @@ def load_student(
     if is_fast:
         qwen3_5.choose_kernels(computed, device_name)
     auto_class: Any = AutoModelForImageTextToText if sees else AutoModelForCausalLM
-    dtypes: Any = {"dtype": torch.float32 if is_trained else computed, "use_safetensors": True}
+    dtypes: Any = {"config": config, "dtype": torch.float32 if is_trained else computed, "use_safetensors": True}
     with loading_errors("student", adapter or path):
         model, info = auto_class.from_pretrained(**arguments, **dtypes, output_loading_info=True)
         if missing := sorted(info["missing_keys"]):  # the library would draw them at random
@@ -261,4 +259,5 @@ def load_student(
     model.to(device_name)
     if is_fast and device_name == "cuda":
         qwen3_5.fuse_norms(model)
+    log.info("the student is loaded")
     return Student(tokenizer, library, template, model=model, device=device_name, dtype=computed, stored=stored)

@@ -272,7 +272,7 @@ def _context(
     reader = PictureReader(student, trees, cfg.max_pixels)
     context = TrainingContext(student, cfg, seed, accelerator, train, val, reader)
     context.read_pictures()
-    for name, split in (("train", train), ("val", val)):
+    for name, split in {"train": train, **({"val": val} if cfg.validation_samples else {})}.items():
         words = "%s: %s has %d samples with %d tokens, %d of them in answers"
         num_answer = sum(len(sample.row.answer_ids) for sample in split.used)
         log.info(words, STAGE, name, len(split.used), split.lengths.sum(), num_answer)
