@@ -146,7 +146,7 @@ FAULTS: dict[str, tuple] = {
     "nobody: headers that never end": (raw(HEAD, b"X: y\r\n", pause_s=0.02, is_endless=True), silent("timeout",
         "within 3 s"), IMPATIENT),
     "nobody: a byte now and then": (raw(HEAD + b"Content-Length: 9999\r\n\r\n", b" ", pause_s=0.02, is_endless=True),
-        silent("timeout", "raise the time limit, such as caption.endpoint.timeout_s=6"), IMPATIENT),
+        silent("timeout", "raise the limit, such as caption.endpoint.timeout_s=6"), IMPATIENT),
 }  # fmt: skip
 
 
@@ -276,7 +276,7 @@ def test_prompts_that_a_server_cuts_in_silence_are_reported(tmp_path, caplog):
     with deciding() as server:  # counts 1,000 tokens for every prompt
         run(settings(server.url, limit=15), tree, tmp_path / "out")
     assert "all count 1000 tokens" in caplog.text
-    assert caplog.text.count("the first request is sent; an answer may take up to 60 s") == 1
+    assert caplog.text.count("the first request is sent, with a limit of 60 s") == 1
 
 
 @each(("step", "is_cut"), [(2, False), (10, True)])

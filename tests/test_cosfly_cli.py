@@ -15,6 +15,7 @@ from pydantic import BaseModel, Field
 from cosfly import cli
 from cosfly.cli import options
 from cosfly.cli.options import Job, resolve
+from cosfly.cli.run import print_run
 from cosfly.llm.client import ChatClient, EndpointConfig
 from cosfly.llm.protocol import base_url
 from cosfly.pipeline.command_settings import SECTIONS
@@ -22,7 +23,7 @@ from cosfly.pipeline.settings import RunConfig, explain, nested
 from cosfly.runtime.config import Config, load
 from cosfly.runtime.errors import ConfigError, InputError, TeacherError
 from cosfly.runtime.json_io import write_json
-from cosfly.runtime.run_dir import StageFolder, Tally
+from cosfly.runtime.run_dir import Dropped, Kept, StageFolder, Tally
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -137,6 +138,17 @@ def test_failed_items_make_the_command_exit_1_unless_the_settings_accept_them(ca
         Job(RunConfig()).finish(tmp_path / "product", tmp_path)
     Job(RunConfig(max_failed=1)).finish(tmp_path / "product", tmp_path)
     assert capfd.readouterr().out.count("product") == 2
+
+
+def test_the_items_of_a_stage_that_is_not_complete_are_so_far(capfd, tmp_path):
+    (tmp_path / "run.yaml").write_text("seed: 1\n")
+    stage = StageFolder(tmp_path / "render", "render", is_complete=False)
+    write_json(stage.path / "stage.json", {})
+    with stage.journal as journal:
+        for record in (Kept(id="a"), Kept(id="b"), Dropped(id="c", reason="short")):
+            journal.append(record.model_dump())
+    print_run(tmp_path)
+    assert "2 kept, 1 dropped (short 1) of 3 so far" in " ".join(capfd.readouterr().out.split())
 
 
 def test_an_address_that_holds_a_secret_is_refused_without_it():

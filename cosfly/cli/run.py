@@ -80,7 +80,8 @@ def print_run(run: Path, *, with_settings: bool = False) -> None:
     for stage in summary.stages:
         seconds = "" if stage.seconds is None else f"{stage.seconds:.1f}"
         disk = size(stage.size_bytes) if stage.size_bytes else ""
-        rows.append((stage.name, stage.state, str(stage.tally or ""), seconds, disk))
+        items = str(stage.tally or "") + " so far" * (stage.state == "begun")
+        rows.append((stage.name, stage.state, items, seconds, disk))
     total = sum(stage.size_bytes for stage in summary.stages)
     typer.echo(f"{run}: {summary.cfg.name}, {summary.progress} stages complete, {size(total)}{summary.held}")
     head = ("stage", "state", "items", "seconds", "on disk")

@@ -197,8 +197,7 @@ class ChatClient:
 
     async def _try(self, request: Request, sent_s: float) -> Reply:
         """Try once to get the answer of a request; NoAnswer fails this try, TeacherError all requests."""
-        first = f"the first request is sent; an answer may take up to {self.cfg.timeout_s:g} s (endpoint.timeout_s)"
-        self._tell_once("sent", logging.INFO, first)
+        self._tell_once("sent", logging.INFO, f"the first request is sent, with a limit of {self.cfg.timeout_s:g} s")
         try:
             reply = await self.ask(request)
         except (TimeoutError, httpx.RequestError) as error:  # also a compressed body
@@ -359,9 +358,8 @@ class ChatClient:
     def message_of(self, error: Exception) -> str:
         """Return the message of an exchange that failed."""
         if isinstance(error, TimeoutError | httpx.TimeoutException):
-            limit_s = self.cfg.timeout_s
-            fix = f"raise the time limit, such as caption.endpoint.timeout_s={2 * limit_s:g}"
-            return f"no answer within {limit_s:g} s; {fix}, or use a faster server, a smaller model or shorter prompts"
+            fix = f"raise the limit, such as caption.endpoint.timeout_s={2 * self.cfg.timeout_s:g}, or use a"
+            return f"no answer within {self.cfg.timeout_s:g} s; {fix} faster server, a smaller model or shorter prompts"
         return self._clean(f"{type(error).__name__} {error}")
 
     def _clean(self, text: str) -> str:

@@ -262,12 +262,9 @@ def walkable_ground(
     with timed(seconds, "connectivity"):
         parts = _parts_of_large_components(free, cfg.min_component_cells, counts, where if roi is None else roi_where)
     if num_left_out := counts["cells_walkable"] - counts["cells_used"]:
-        log.info(
-            "%s: %d walkable cells (%.0f m2) are not used: they lie in areas of fewer than "
-            "pedestrians.min_component_cells=%d connected cells (number of areas: %d)",
-            where, num_left_out, num_left_out * cfg.resolution_m**2, cfg.min_component_cells,
-            counts["components"] - counts["components_used"],
-        )  # fmt: skip
+        num_areas = counts["components"] - counts["components_used"]
+        text = "%s: %d walkable cells in areas below pedestrians.min_component_cells=%d are not used (areas: %d)"
+        log.info(text, where, num_left_out, cfg.min_component_cells, num_areas)
     with timed(seconds, "footing"):
         costs = costs_of(cfg.open_cost, cfg.road_cost)
         footing = footing_of(box_map, grid)
