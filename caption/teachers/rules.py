@@ -34,7 +34,7 @@ NEAR_M, COMING_M = 3.0, 6.0  # from the target to a bystander at its side, to on
 MOST_DIFFERENCES = 1  # in appearance, of a person who is similar
 SLOW_MPS, SLIDING_MPS, CRAWLING_MPS, DRIFTING_MPS = 0.3, 0.5, 0.7, 0.2
 HALTED_MPS, STILL_MPS, DAWDLING_MPS = 0.05, 0.15, 0.5  # a slower pedestrian has stopped; stands; moves slowly
-TURNING_DPS, SLIGHT_DPS, CLIMBING_MPS = 1.0, 3.0, 0.2  # slower turns and climbs are not worth a sentence; are slight
+TURNING_DPS, SLIGHT_DPS, CLIMBING_MPS = 1.0, 3.0, 0.15  # slower turns and climbs are not worth a sentence; are slight
 SIDES = (("left", "right"), ("left",), ("right",))  # by the side of the decision
 HIDDEN = ("occluded", "out_of_view")
 CLOSE_M = 15.0  # a target that comes nearer than this leaves the drone little room
@@ -296,7 +296,7 @@ def is_opposed(f: Facts, name: str, side: int) -> bool:
         case "straight":
             leaves = abs(last_deg) - abs(first_deg) >= 2 * DRIFT_DEG and abs(last_deg) > LITTLE_DEG
             turns_off = abs(f.yaw_rate_dps[-1] or 0.0) >= SLIGHT_DPS and not is_bearing_steady(f)
-            falls_back = opens_m >= 1.0 and walk_mps > speed_mps + SLIDING_MPS
+            falls_back = opens_m >= SLIDING_MPS and walk_mps > speed_mps + SLIDING_MPS
             changes = (hurries(f, 0) or slows(f, 0)) and word_of(f, "trend:distance") != "steady"
             is_aside = max(-ahead_mps, abs(left_mps), abs(up_mps)) > max(SLIDING_MPS, ahead_mps)
             is_still = ahead_mps < DRIFTING_MPS
@@ -351,7 +351,8 @@ CONDITIONS: dict[str, Condition] = {
     and side * (f.bearing_deg[-1] or 0.0) >= -ACROSS_SIGHT_DEG,
     "on_its_side": lambda f, side: side * (f.bearing_deg[-1] or 0.0) >= 1.0,
     "strafes_to": lambda f, side: strafes_on(f, side) and side * (f.bearing_deg[-1] or 0.0) >= 1.0,
-    "strafes_round": lambda f, side: strafes_on(f, side) and (f.target_speed_mps or 0.0) < DAWDLING_MPS,
+    "strafes_round": lambda f, side: strafes_on(f, side)
+    and max(f.target_speed_mps or 0.0, f.target_speeds_mps[-1] or 0.0) < SLOW_MPS,
     "strafes_on": strafes_on, "circles_on": circles_on, "bearing_steady": lambda f, side: is_bearing_steady(f),
     "drifts": drifts,
     "turned": lambda f, side: is_smooth(f, side) and abs(f.yaw_deg[-1]) >= LEAST_TURN_DEG,
