@@ -141,8 +141,8 @@ def stands(f: Facts, side: int) -> bool:
 
 
 def turns(f: Facts, side: int) -> bool:
-    turn_deg = f.target_turn_deg or 0.0
-    return walks(f, side) and not is_shaken(f) and (side * turn_deg if side else abs(turn_deg)) >= BEND_DEG
+    turn_deg, is_brisk = f.target_turn_deg or 0.0, (f.target_speed_mps or 0.0) >= DAWDLING_MPS
+    return is_brisk and walks(f, side) and not is_shaken(f) and (side * turn_deg if side else abs(turn_deg)) >= BEND_DEG
 
 
 def _walk_deg(f: Facts) -> float | None:
@@ -472,7 +472,7 @@ def write_templates(
     for token in [decision] if decision else ranked(facts):
         side = ("left" in token) - ("right" in token)
         name = FAMILY_OF[token]
-        if not decision and is_opposed(facts, name, side):
+        if is_opposed(facts, name, side):
             continue
         if reasons := list(choose.holding(sentences()["reasons"][name], side)):
             break
