@@ -317,7 +317,7 @@ def test_a_policy_that_hangs_is_stopped_in_a_line(ask, follow):
     policy = Policy("own:Never", 0.1, 0, most_late=3)
     seen = SimpleNamespace(simulation=follow._simulation, moments=[follow._now], episode="a")
     assert [policy.decide([seen])[0].answer for _ in range(2)] == ["late", "late"]
-    with pytest.raises(TeacherError, match=r"own:Never: the policy hangs .*fly\.answer_limit_s"):
+    with pytest.raises(TeacherError, match=r"own:Never: the policy did not answer in time .*fly\.answer_limit_s"):
         policy.decide([seen])
     # What Python cannot interrupt ends with its worker, once.
     watch = watch_of(FlyConfig(student="policy:own:Never", answer_limit_s=5), Watch())

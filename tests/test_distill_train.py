@@ -308,7 +308,7 @@ def test_a_loss_that_is_no_number_leaves_the_last_good_checkpoint(place, tmp_pat
 
     with monkeypatch.context() as patch:
         patch.setattr(fit, "answer_loss", broken)
-        with pytest.raises(ConfigError, match="not finite"):
+        with pytest.raises(ConfigError, match="became infinite or NaN"):
             run(place, tmp_path / "out")
     newest = newest_checkpoint(tmp_path / "out" / "checkpoints")
     assert newest is not None
