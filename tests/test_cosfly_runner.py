@@ -347,7 +347,9 @@ def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
     )
     env = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     env |= {"PYTHONPATH": str(package.parent), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    env["PYTHONDONTWRITEBYTECODE"] = "1"  # Python knows a file by its size and second: both may be those of before
+    env["PYTHONDONTWRITEBYTECODE"] = (
+        "1"  # an edit within a second that keeps the size would leave the old bytecode in use
+    )
     printed = []
     for factor in (2, 3, 2):
         (package / "lower.py").write_text(

@@ -53,8 +53,7 @@ LEROBOT = ("lerobot==0.4.4", "datasets==4.4.1", "av==15.1.0", *_LIGHT.split(), *
 
 
 def python_with(pins: tuple[str, ...]) -> Path:
-    """Give the interpreter of an environment with these packages; skips the test only where no registry can be
-    reached."""
+    """Return the interpreter of an environment with these packages; skip the test if no registry can be reached."""
     name = hashlib.sha256("\n".join([sys.version, *pins]).encode()).hexdigest()[:16]
     KEPT_IN.mkdir(exist_ok=True)
     with FileLock(KEPT_IN / f"{name}.lock"):  # the tests of another worker may need it now, too

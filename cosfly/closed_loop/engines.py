@@ -176,9 +176,8 @@ class PromptedEngine:
         except (NoAnswer, CosflyError) as error:
             if isinstance(error, CosflyError) and error.fatal:
                 raise
-            if self._is_rules and isinstance(
-                error, NoAnswer
-            ):  # a flight needs a decision, also where no fact supports one
+            if self._is_rules and isinstance(error, NoAnswer):
+                # A flight needs a decision, also where no fact supports one.
                 return EngineDecision("ok", decide(question.facts), str(error)[:MOST_WORDS])
             return EngineDecision("none", words=str(error)[:MOST_WORDS])
         is_timed = not (self._is_rules or reply.is_kept)  # so that the records of rules are always the same

@@ -179,9 +179,8 @@ class ClosedLoopTrajectory:
         self.index = i
         self.poses.positions_m[i] = path_m[end]
         self.poses.rotations_deg[i] = [pitch_deg, yaw_deg, 0.0]
-        self.poses.clearances_m[i - 1 : i + 1] = (
-            clearance_m  # of the way from frame i - 1; a next step replaces that of i
-        )
+        # The clearance of a frame is that of the way to the next one, so that a next step replaces that of frame i.
+        self.poses.clearances_m[i - 1 : i + 1] = clearance_m
         moment = self._drawn(i, self.velocity_mps.copy(), clearance_m)
         self._unseen_s = 0.0 if moment.target.visible else self._unseen_s + self.dt_s
         low, high = self.airspace.bounds_m
