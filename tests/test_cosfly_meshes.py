@@ -121,16 +121,16 @@ HOSTILE = {
     "far.glb": (one_triangle([1e30, *FLAT[1:]]), "not finite or is more than 10,000,000 m"),
     "count.glb": (
         one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 2_000_000_000}]),
-        "declares a negative number of values, or too many",
+        "declares too many values, or a negative count",
     ),
     "below_nothing.glb": (
         one_triangle(FLAT, bufferViews=[{"buffer": 0, "byteLength": n} for n in (36, -9, 36, 36)]),
-        "declares a negative number of values, or too many",
+        "declares too many values, or a negative count",
     ),
     "short_buffer.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 6}]), "cannot be parsed"),
     "repeated.glb": (
         one_triangle(FLAT, bufferViews=[{"buffer": 0, "byteLength": 2**30}] * 9),
-        "declares a negative number of values, or too many",
+        "declares too many values, or a negative count",
     ),
     "empty.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 0}]), "no triangles"),
     "sparse.glb": (

@@ -366,7 +366,7 @@ def test_an_evaluation_with_an_encoder_names_it(place, encoder):
 
 
 @pytest.mark.parametrize(("name", "config", "words"), [
-    ("empty", None, "not an encoder"), ("unknown", '{"model_type": "no_such_model"}', "cannot be loaded"),
+    ("empty", None, "no encoder that the library"), ("unknown", '{"model_type": "no_such_model"}', "cannot be loaded"),
     ("t5-small", "{}", "T5"),
 ])  # fmt: skip
 def test_a_folder_that_is_no_encoder_is_named(tmp_path, name, config, words):

@@ -116,6 +116,13 @@ def test_a_family_trains_resumes_merges_and_answers(place, family, tmp_path):
     assert bool(taught["looks"][0]["views"]) == (family.name not in TEXT_ONLY)
 
 
+@pytest.mark.slow
+def test_a_family_trains_all_weights_as_on_an_accelerator(place, family, tmp_path):
+    """The frozen vision tower beside float32 weights, computed in bfloat16."""
+    run(place, tmp_path, family, method="full", dtype="bfloat16", max_steps=1)
+    assert np.isfinite(losses_of(tmp_path)).all()
+
+
 def test_the_decision_can_weigh_more_and_come_first(place, llama):
     own, sample = load_student(llama, device="cpu"), samples_of(place)[0].without_pictures()
     row = own.encode(sample, decision_weight=20.0)

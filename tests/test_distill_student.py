@@ -132,7 +132,7 @@ def test_a_template_that_writes_something_else_ends_before_the_first_step(place,
     )
     assert signed != text
     path.write_text(signed)
-    with pytest.raises(InputError, match="the training text differs from that of the chat template"):
+    with pytest.raises(InputError, match="the chat template does not write the text that the student is trained on"):
         train.run(TrainConfig(**FAST), place / "set", [place / "tree"], folder, tmp_path / "out")
 
 

@@ -37,8 +37,8 @@ def show_windows(
         TeacherError: No window gets an answer.
     """
     if cfg.teacher_kind in EMBEDDED:
-        what = "a trial shows questions to a model and its answers, but this teacher asks no model"
-        raise ConfigError(what, where="--try", got=f"--teacher {cfg.teacher}", expected="a URL or vllm:MODEL_DIR")
+        expected = "--teacher URL or --teacher vllm:MODEL_DIR"
+        raise ConfigError("this teacher asks no model", where="--try", got=f"--teacher {cfg.teacher}", expected=expected)
     vocabulary = vocabulary_of(cfg)
     cfg = student_settings(cfg, vocabulary)
     if open_stage(cfg, data, out, seed, resume).is_complete:

@@ -127,9 +127,8 @@ def _read_gltf(text: bytes, binary: bytes, path: Path) -> dict[str, np.ndarray]:
     counts = [*(accessors[k]["count"] for k in used), *(view["byteLength"] for view in views)]
     most = int(MOST_NUMBERS + FILE_MB * MB)
     if min(counts, default=0) < 0 or sum(counts) > most:
-        expected = f"no negative number, and at most {most:,} values and bytes in all"
-        what = "the mesh file declares a negative number of values, or too many values"
-        got, fix = f"{sum(counts):,} values and bytes in all", "export the mesh again with fewer triangles"
+        what, got = "the mesh file declares too many values, or a negative count", f"{sum(counts):,} values and bytes"
+        expected, fix = f"at most {most:,}, and no negative count", "export the mesh again with fewer triangles"
         raise InputError(what, where=path, got=got, expected=expected, fix=fix)
     sizes = [sum(accessors[_accessors_of(primitive)[-1]]["count"] for primitive in mesh) for mesh in drawn]
     check_num_triangles(path, sum(sizes) // 3)

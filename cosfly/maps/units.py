@@ -59,9 +59,9 @@ def refused(declared: str, where: str) -> InputError:
         "the declared coordinate system is not supported",
         where=where,
         got=declared[:80],
-        expected="EPSG:4326 (not in CityJSON), or true metres such as UTM (EPSG:326NN)",
-        fix="convert the file (ogr2ogr -t_srs EPSG:4326, cjio reproject), or set maps.boxes.units or "
-        "maps.cityjson.units to the unit of its coordinates: m, ft (0.3048 m) or us-ft (0.3048006 m)",
+        expected="a metric system such as UTM (EPSG:326NN); for GeoJSON also EPSG:4326",
+        fix="convert the file (ogr2ogr -t_srs EPSG:4326 for GeoJSON, cjio reproject for CityJSON), or set "
+        "maps.boxes.units or maps.cityjson.units to the unit of the coordinates: m, ft or us-ft",
     )
 
 

@@ -135,11 +135,11 @@ def run(
     """Read a run directory; write `reproduction.html` and `reproduction.json`, and return the page."""
     done = [stage.name for stage in summarize(folder).stages if stage.state == "complete"]
     if missing := [name for name in STAGES if name not in done]:
-        fix = f"finish the run with cosfly run {folder}"
+        what, fix = "the run is not finished", f"finish it with cosfly run {folder}"
         if cfg.towns:
-            fix = f"pass the directory of one town of this run, such as {folder}/{next(iter(cfg.towns))}"
-        got = f"unfinished stages in this directory: {', '.join(missing)}"
-        raise InputError("the directory has no finished drone trajectories", where=folder, got=got, fix=fix)
+            what = "the run has several towns, and its directory itself has no drone trajectories"
+            fix = f"pass the directory of one town, such as {folder}/{next(iter(cfg.towns))}"
+        raise InputError(what, where=folder, got=f"no results of the stages {', '.join(missing)}", fix=fix)
     sample = measure(cfg, folder, out, pedestrians, done, pool | {"seed": seed, "resume": resume})
     reader = FigureReader([folder, out], {} if sample is None else {"sample": sample})
     reader.derived |= derived_figures(cfg, folder, reader, done)

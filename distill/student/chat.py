@@ -251,8 +251,8 @@ def check_template(processor: Processor, sample: Sample) -> None:
     taught = processor.prompt_text(sample) + processor.lead + sample.answer + processor.end_of_answer
     if taught != whole:
         at = next((i for i, pair in enumerate(zip(taught, whole, strict=False)) if len(set(pair)) > 1), len(taught))
-        got, expected = (f"{text[at : at + 40]!r} at character {at}" for text in (taught, whole))
-        words = "the training text differs from that of the chat template"
+        expected, got = (f"{text[at : at + 40]!r} at character {at}" for text in (taught, whole))
+        words = "the chat template does not write the text that the student is trained on"
         raise InputError(words, where="student", got=got, expected=expected, fix="correct the chat template")
 
 

@@ -106,8 +106,7 @@ def prepared_student(cfg: TrainConfig, base: Path, seed: int, device: str) -> St
         language = {*student.core.get_decoder().modules(), student.core.get_output_embeddings()}
         for module in student.core.base_model.children() if student.has_pictures and not cfg.train_vision else ():
             if module not in language:
-                module.requires_grad_(False)
-                module.to(student.dtype)
+                module.requires_grad_(False)  # in float32 as the rest: SmolVLM takes the type of its tower for all
     if cfg.compile:
         for layer in student.core.get_decoder().layers:
             layer.compile(dynamic=True)

@@ -118,13 +118,13 @@ def _check(caption: Caption, *, is_known: bool) -> None:
     """Raise InputError unless a caption is of a track of the tree and, if accepted, in both languages."""
     if not is_known:
         raise InputError(
-            "the track of the caption does not exist",
-            got="/".join((caption.town, caption.trajectory, caption.variant)), expected="a track of the playback tree",
-            fix="pass the captions that were made from this tree",
+            "the tree of the run has no track of this caption",
+            got="/".join((caption.town, caption.trajectory, caption.variant)), expected="a track of the tree that the release is built from",
+            fix="pass the captions of this run",
         )  # fmt: skip
     if not caption.sample_id.endswith(sample_id(f"{caption.trajectory}_{caption.variant}", caption.frame_index)):
         got = f"{caption.sample_id} for frame {caption.frame_index}"
         raise InputError("the sample_id of the caption does not match its frame", got=got)
     if caption.status == "accepted" and (caption.en is None or caption.zh is None):
-        fix = "caption the tree in English and Chinese, which a release needs"
-        raise InputError("the accepted caption lacks a language", fix=fix)
+        fix = "run cosfly caption again with both languages: a release needs English and Chinese"
+        raise InputError("the accepted caption has no text in one of the two languages", fix=fix)

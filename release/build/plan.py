@@ -186,7 +186,7 @@ def _index_captions(sources: list[Source], material: Material, tracks: list[Chos
         released = dict[FlightKey, TrackCaptions]()
         for track in (track for track in tracks if track.candidate.source == number):
             if track.candidate.key in released:
-                what, fix = "several runs of the tree have the track of this caption", "build a release of each run"
+                what, fix = "the track occurs in several runs below this directory", "build a release of each run"
                 raise InputError(what, where=source.captions, got="/".join(track.candidate.key), fix=fix)
             released[track.candidate.key] = track.captions
         others = {one.key for one in material.candidates if one.source == number} - released.keys()
