@@ -111,7 +111,8 @@ class WindowDataset(Sequence[WindowData]):
         self._shards = [TableRows(path, self._columns) for path in paths]
         self._places = [place for number, path in enumerate(paths) for place in self._places_in(number, path)]
         if not self._places:
-            what, expected = "the release has no usable window", f"windows with all their frames and an accepted caption in {language!r}"
+            what = "the release has no usable window"
+            expected = f"windows with all their frames and an accepted caption in {language!r}"
             fix = "build the release with --set release.selection=windows, which keeps consecutive frames"
             raise InputError(what, where=source, expected=expected, fix=fix)
 

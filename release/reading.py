@@ -284,12 +284,12 @@ def read_tracks(
         own, of_points = next(points, (None, ()))
         if own != place:
             got = "no further points" if own is None else f"points of {track_name(own)}"
-            what, expected = "the points file has other tracks than the frames file of this shard", f"points of {track_name(place)}"
+            what, expected = "the points file has other tracks than the frames file", f"points of {track_name(place)}"
             raise InputError(what, where=folder / shard.points.path, got=got, expected=expected, fix=REBUILD)
         name = track_name(place)
         yield TrackRows(name, list(frames)), TrackRows(name, list(of_points))
     if (more := next(points, None)) is not None:
-        what, got = "the points file has other tracks than the frames file of this shard", f"points of {track_name(more[0])}"
+        what, got = "the points file has other tracks than the frames file", f"points of {track_name(more[0])}"
         raise InputError(what, where=folder / shard.points.path, got=got, expected="no further points", fix=REBUILD)
 
 

@@ -37,8 +37,8 @@ def show_windows(
         TeacherError: No window gets an answer.
     """
     if cfg.teacher_kind in EMBEDDED:
-        expected = "--teacher URL or --teacher vllm:MODEL_DIR"
-        raise ConfigError("this teacher asks no model", where="--try", got=f"--teacher {cfg.teacher}", expected=expected)
+        what, expected = "this teacher asks no model", "--teacher URL or --teacher vllm:MODEL_DIR"
+        raise ConfigError(what, where="--try", got=f"--teacher {cfg.teacher}", expected=expected)
     vocabulary = vocabulary_of(cfg)
     cfg = student_settings(cfg, vocabulary)
     if open_stage(cfg, data, out, seed, resume).is_complete:

@@ -128,7 +128,7 @@ def asked_samples(samples: Sequence[Sample], predictions: Predictions) -> list[S
         if unknown := own.keys() - keys:
             what = "the training set does not contain this sample, for which there is a prediction"
             fix = "pass the training set for which the predictions were made"
-            raise InputError(what, where=f"{name}: {min(unknown)}", got=f"{len(unknown)} samples of the predictions that are not in this split", fix=fix)
+            raise InputError(what, where=f"{name}: {min(unknown)}", got=f"{len(unknown)} unknown samples", fix=fix)
     asked = [sample for sample in samples if all(sample.key in own for own in predictions.values())]
     if not asked:
         raise InputError("the students have no sample in common", got=f"predictions of {', '.join(predictions)}")
@@ -189,8 +189,8 @@ def _examples(samples: Sequence[Sample], predictions: Predictions, most: int, se
 def encoder_files(folder: Path) -> list[Path]:
     """Return the files that decide an encoder's scores: configuration, tokenizer, weights."""
     if not (folder / "config.json").is_file():
-        expected = "a folder with config.json, tokenizer and weights"
-        raise InputError("the folder has no encoder that the library transformers can load", where=folder, expected=expected)
+        what = "the folder has no encoder that the library transformers can load"
+        raise InputError(what, where=folder, expected="a folder with config.json, tokenizer and weights")
     kinds = ("*.json", "*.txt", "*.safetensors", "*.bin", "*.model")
     return sorted({path for kind in kinds for path in folder.glob(kind) if path.is_file()})
 

@@ -119,7 +119,7 @@ def _check(caption: Caption, *, is_known: bool) -> None:
     if not is_known:
         raise InputError(
             "the tree of the run has no track of this caption",
-            got="/".join((caption.town, caption.trajectory, caption.variant)), expected="a track of the tree that the release is built from",
+            got="/".join((caption.town, caption.trajectory, caption.variant)), expected="a track of this run's tree",
             fix="pass the captions of this run",
         )  # fmt: skip
     if not caption.sample_id.endswith(sample_id(f"{caption.trajectory}_{caption.variant}", caption.frame_index)):
