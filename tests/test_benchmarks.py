@@ -21,7 +21,6 @@ from commands import invoke, working_here
 here = working_here()
 here.__enter__()
 """
-DRAWN_SMALL = "--set render.width_px=160 --set render.height_px=90 --set fly.tree=false --set fly.most_decisions=6"
 
 
 # A benchmark; arguments, with RUN for a finished run and OUT for a new directory; a pattern of what is printed; and
@@ -50,13 +49,6 @@ bench.TURNS, bench.census_town = 1, lambda name, seed: load(SyntheticConfig(), s
              r'"target_found": {"trained": [01]\.\d+', """
 bench.VISION.update(hidden_size=32, intermediate_size=32, num_hidden_layers=1, num_attention_heads=2)
 bench.assemble = lambda language, out, tower: None  # needs the weights of SmolLM2
-"""),
-    ("dagger_rounds", f"--train RUN --test RUN --out OUT {DRAWN_SMALL}", r"r1 success",
-             HERE + """
-def cosfly(*words):
-    done = invoke([*words])
-    assert done.exit_code == 0, done.output
-bench.STEPS, bench.cosfly = 5, cosfly
 """),
 )  # fmt: skip
 
