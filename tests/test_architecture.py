@@ -25,7 +25,7 @@ STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")
 # siblings.
 ROOMS = ("runtime", "axes", "formats", "geometry", "viz", "llm", "simulators", "stages", "siblings", "pipeline", "cli")
 # Geometry that knows no file, so that formats may use it.
-BELOW_FORMATS = {f"cosfly.geometry.{name}" for name in ("axes", "ground", "motion")}
+BELOW_FORMATS = {f"cosfly.geometry.{name}" for name in ("axes", "motion")}
 ASSEMBLY = ("pipeline", "closed_loop", "envs", "studies", "worldgen")  # what may know all stages and siblings
 HEAVY = {
     *("torch", "transformers", "peft", "accelerate", "bert_score", "datasets"),

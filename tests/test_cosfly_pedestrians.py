@@ -18,7 +18,6 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths
 from cosfly.formats.roi import Roi
 from cosfly.geometry.axes import DT_S
 from cosfly.geometry.grid import OccupancyGrid
-from cosfly.geometry.ground import Ground
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.bystanders import bystanders_of, gaps_m
@@ -62,7 +61,7 @@ def ground_of(text: str) -> WalkableGround:
 
 def ground_in(parts: np.ndarray) -> WalkableGround:
     grid = OccupancyGrid(0.0, 0.0, 1.0, parts == 0)
-    return WalkableGround(grid, grid, parts, np.zeros(parts.shape, np.uint8), Ground.flat(0.0), costs_of(1, 1))
+    return WalkableGround(grid, grid, parts, np.zeros(parts.shape, np.uint8), 0.0, costs_of(1, 1))
 
 
 def write_roi(path: Path, points: list) -> Path:

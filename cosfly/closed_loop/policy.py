@@ -39,9 +39,8 @@ def observe(simulation: ClosedLoopTrajectory, now: Moment, *, depth: bool = Fals
     rgb (h, w, 3) uint8; state (7,) float32 as STATE; depth (h, w) float32 m; goal: all clothes of the target, of
     which a hard distractor shares all but one.
     """
-    ground_m = float(simulation.airspace.ground.height_at(now.position_m[None])[0])
     pitch_deg, yaw_deg, _ = now.rotation_deg
-    height_m = float(now.position_m[2]) - ground_m
+    height_m = float(now.position_m[2]) - simulation.airspace.ground_z_m
     velocity_mps = in_axes_of(float(yaw_deg), now.velocity_mps)
     state = np.array([*velocity_mps, height_m, wrap_deg(yaw_deg), pitch_deg, now.time_s], dtype=np.float32)
     goal = words_of(("figure", *SLOTS), simulation.script.clothes.looks)["en"]

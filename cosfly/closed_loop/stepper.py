@@ -63,7 +63,7 @@ class Airspace:
         self.renderer: Renderer = renderer_of(cfg, boxes, num_others, None if like is None else like.renderer)
         self.pools = read_pools(cfg)
         self.surroundings = Surroundings(simplified)
-        self.ground = simplified.ground
+        self.ground_z_m = simplified.ground_z_m
         self.town = town_folder(cfg.town or boxes.name)
         self.bounds_m = boxes.bounds()
         self._lit: object = None  # area and weather that the renderer is prepared for
@@ -170,7 +170,7 @@ class ClosedLoopTrajectory:
         path_m, yaw_deg, pitch_deg = self._path(np.asarray(command, dtype=np.float64))
         # Entry k is the clearance on the way from point k to point k + 1; the last one is that of the last point alone.
         gaps_m, _, _ = swept_distances(self.airspace.surroundings.obstacles, path_m, CLEARANCE_CAP_M)
-        over_ground_m = path_m[:, 2] - self.airspace.ground.height_at(path_m)
+        over_ground_m = path_m[:, 2] - self.airspace.ground_z_m
         gaps_m = np.minimum(gaps_m[:-1], np.minimum(over_ground_m[:-1], over_ground_m[1:]))  # of each part of the path
         hits = np.flatnonzero(gaps_m < self.drone.radius_m)
         end = int(hits[0]) if len(hits) else len(path_m) - 1  # the drone stops before the part that touches

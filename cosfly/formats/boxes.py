@@ -5,21 +5,19 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
 from cosfly.formats.columns import FARTHEST_M, LARGEST, rounded
 from cosfly.formats.kinds import GROUND_KINDS, KIND_COLORS, KIND_NAMES, KINDS
 from cosfly.formats.meshes import Meshes, MeshRef
 from cosfly.geometry.axes import axis_aligned_half_extents
-from cosfly.geometry.ground import Ground
 from cosfly.runtime.errors import InputError, json_type, nearest
 from cosfly.runtime.io import write_bytes
-from cosfly.runtime.json_io import MISSING, FileFormat, Record, check_schema, dump_json, read_json, validated
+from cosfly.runtime.json_io import MISSING, FileFormat, check_schema, dump_json, read_json, validated
 
 BOXES_FORMAT = FileFormat("cosfly.boxes_3d", "1.0", "map")
 MAP_MB = 4_096  # 15 million boxes; a file of ten million has 2.7 GB
@@ -71,46 +69,14 @@ class SimplifyPass(_Kept):
     counts: dict[str, int]
 
 
-Height = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
-
-
-class GroundGrid(Record):
-    """Sloping ground in the header of a map. heights_m: Rows from south to north, each from west to east."""
-
-    west_m: Height
-    south_m: Height
-    cell_m: float = Field(gt=0, le=LARGEST)
-    heights_m: list[list[Height]] = Field(min_length=2)
-
-    @model_validator(mode="after")
-    def _rows_are_even(self) -> GroundGrid:
-        lengths = {len(row) for row in self.heights_m}
-        if len(lengths) != 1 or lengths.pop() < 2:
-            raise ValueError("all rows of heights_m must have the same number of heights, at least two")
-        return self
-
-    def ground(self) -> Ground:
-        return Ground(np.array(self.heights_m, dtype=np.float64), self.west_m, self.south_m, self.cell_m)
-
-    @classmethod
-    def of(cls, ground: Ground) -> GroundGrid:
-        """Return the record of a ground, with heights rounded to a millimetre."""
-        rows = np.round(ground.heights_m, 3).tolist()
-        return cls(west_m=ground.west_m, south_m=ground.south_m, cell_m=ground.cell_m, heights_m=rows)
-
-
 class MapHeader(_Kept):
-    """The header of a map. A file holds only the fields that are set.
-
-    ground_z_m: Height of flat ground; `ground` holds the heights of sloping ground. Stages use `BoxMap.ground`.
-    """
+    """The header of a map. A file holds only the fields that are set."""
 
     name: str = "map"
     source: MapSource = MapSource()
     licence: LicenceId = UNKNOWN_LICENCE
     credits: str = ""  # the attribution that the licence requires, in sentences
-    ground_z_m: float = Field(0.0, ge=-LARGEST, le=LARGEST)
-    ground: GroundGrid | None = None
+    ground_z_m: float = Field(0.0, ge=-LARGEST, le=LARGEST)  # height of the ground, which is flat
     extent_sources: dict[str, int] = {}  # number of boxes by the source of their size
     roads: dict[str, float] = {}
     added_boxes: int = 0  # number of boxes that the source does not hold
@@ -148,10 +114,10 @@ class BoxMap:
     def name(self) -> str:
         return self.header.name
 
-    @cached_property
-    def ground(self) -> Ground:
-        """The height of the ground at each position."""
-        return self.header.ground.ground() if self.header.ground else Ground.flat(self.header.ground_z_m)
+    @property
+    def ground_z_m(self) -> float:
+        """The height of the ground."""
+        return self.header.ground_z_m
 
     @property
     def mins(self) -> np.ndarray:
@@ -231,13 +197,12 @@ def _first_row(mask: np.ndarray) -> int | None:
 
 
 def check_ground(box_map: BoxMap, path: Path) -> None:
-    """Check that a map has ground: a height or a grid of heights in its header, or a box of a ground kind."""
-    has_heights = box_map.header.model_fields_set & {"ground_z_m", "ground"}
-    if not has_heights and not box_map.is_any_of(GROUND_KINDS).any():
+    """Check that a map has ground: its height in the header, or a box of a ground kind."""
+    if "ground_z_m" not in box_map.header.model_fields_set and not box_map.is_any_of(GROUND_KINDS).any():
         raise InputError(
             "the map has no ground",
             where=path,
-            got="no ground_z_m and no heights in the header, and no box of a ground type",
+            got="no ground_z_m in the header, and no box of a ground type",
             expected="the height of the ground in metres",
             fix="add ground_z_m in metres to the header, or boxes of type Roads, Sidewalks, Terrain or Ground",
         )
@@ -280,7 +245,6 @@ def write_boxes(path: Path, box_map: BoxMap) -> None:
     mins, maxs = box_map.mins, box_map.maxs
     low, high = box_map.bounds() if len(box_map) else (np.zeros(3), np.zeros(3))
     fields = box_map.header.model_dump(mode="json", by_alias=True, exclude_unset=True)
-    ground = fields.pop("ground", None)
     last_fields: dict[str, Any] = {name: fields.pop(name) for name in ("passes", "simplify") if name in fields}
     header: dict[str, Any] = {
         **BOXES_FORMAT.header,
@@ -308,12 +272,9 @@ def write_boxes(path: Path, box_map: BoxMap) -> None:
         if mesh := refs.get(box_id):
             box["mesh"] = mesh.model_dump(exclude_none=True)
         lines.append(dump_json(box))
-    # The header is indented; the heights of the ground take one line, and so does each box.
-    members = [dump_json(header, indent=1).removesuffix("\n}")]
-    if ground:
-        members.append(f' "ground": {dump_json(ground)}')
-    members.append(' "boxes": [\n' + ",\n".join(lines) + "\n]")
-    write_bytes(path, (",\n".join(members) + "}\n").encode())
+    # The header is indented; each box takes one line.
+    text = dump_json(header, indent=1).removesuffix("\n}") + ',\n "boxes": [\n' + ",\n".join(lines) + "\n]}\n"
+    write_bytes(path, text.encode())
 
 
 def read_boxes(path: Path) -> BoxMap:

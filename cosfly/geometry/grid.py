@@ -86,12 +86,10 @@ def blocks_walking(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M) -> np.n
     """Return which boxes block a person, (n,) bool.
 
     A box blocks if it reaches into the interval from the ground to `height_m` above it; touching an end of the interval
-    does not count. On a slope the interval is that of all the ground under the box. Surfaces (GROUND_KINDS) never
-    block; water always does.
+    does not count. Surfaces (GROUND_KINDS) never block; water always does.
     """
-    mins, maxs = box_map.mins, box_map.maxs
-    lowest, highest = box_map.ground.range_under(mins, maxs)
-    is_in_interval = (mins[:, 2] < highest + height_m - TOUCH_M) & (maxs[:, 2] > lowest + TOUCH_M)
+    is_under_head = box_map.mins[:, 2] < box_map.ground_z_m + height_m - TOUCH_M
+    is_in_interval = is_under_head & (box_map.maxs[:, 2] > box_map.ground_z_m + TOUCH_M)
     return (is_in_interval & ~box_map.is_any_of(GROUND_KINDS)) | (box_map.kinds == WATER)
 
 
@@ -109,21 +107,20 @@ def occupancy(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M, like: Occupa
     grid = empty_grid(box_map) if like is None else replace(like, occupied=np.zeros_like(like.occupied))
     boxes = box_map.select(blocks_walking(box_map, height_m=height_m))
     is_water = boxes.kinds == WATER
-    lowest, highest = box_map.ground.range_under(boxes.mins, boxes.maxs)
-    lows = np.where(is_water, -np.inf, lowest)
-    highs = np.where(is_water, np.inf, highest + height_m)
+    lows = np.where(is_water, -np.inf, box_map.ground_z_m)
+    highs = np.where(is_water, np.inf, box_map.ground_z_m + height_m)
     _mark(boxes, grid, grid.occupied, np.ones(len(boxes), bool), lows=lows, highs=highs)
     return grid
 
 
 def lies_off_ground(box_map: BoxMap, kinds: Collection[int]) -> np.ndarray:
-    """Return which boxes of some kinds have their top more than SURFACE_REACH_M off the ground below, (n,) bool."""
-    over_m = box_map.maxs[:, 2] - box_map.ground.height_at(box_map.centers)
+    """Return which boxes of some kinds have their top more than SURFACE_REACH_M off the ground, (n,) bool."""
+    over_m = box_map.maxs[:, 2] - box_map.ground_z_m
     return box_map.is_any_of(kinds) & (np.abs(over_m) > SURFACE_REACH_M)
 
 
 def _surfaces(box_map: BoxMap, kinds: Collection[int]) -> BoxMap:
-    """Return the boxes of some kinds whose tops lie within SURFACE_REACH_M of the ground under their middles."""
+    """Return the boxes of some kinds whose tops lie within SURFACE_REACH_M of the ground."""
     return box_map.select(box_map.is_any_of(kinds) & ~lies_off_ground(box_map, kinds))
 
 
@@ -131,7 +128,7 @@ def surface(box_map: BoxMap, kinds: Collection[int] = GROUND_KINDS, *, like: Occ
     """Return over which cells of a grid the map has ground.
 
     Args:
-        kinds: of ground; a box counts if its top lies within SURFACE_REACH_M of the ground under its middle.
+        kinds: of ground; a box counts if its top lies within SURFACE_REACH_M of the ground.
     Returns:
         (ny, nx) bool, cells that such a box overlaps; None if the map has no such box.
     """
@@ -147,7 +144,7 @@ def surface_kinds(box_map: BoxMap, kinds: Collection[int], *, like: OccupancyGri
     kinds: as for `surface`; of kinds in one plane, to a centimetre, the higher layer counts.
     """
     boxes = _surfaces(box_map, kinds)
-    tops_m = np.round(boxes.maxs[:, 2] - boxes.ground.height_at(boxes.centers), 2)
+    tops_m = np.round(boxes.maxs[:, 2] - boxes.ground_z_m, 2)
     boxes = boxes.select(np.lexsort((_LAYER_OF[boxes.kinds], tops_m)))
     cell_kinds = np.zeros(like.occupied.shape, dtype=np.uint8)
     _mark(boxes, like, cell_kinds, boxes.kinds, touch=0.5 - TOUCH_M)

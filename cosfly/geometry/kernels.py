@@ -83,16 +83,9 @@ def index_boxes(
 
 
 def obstacle_index(box_map: BoxMap) -> BoxIndex:
-    """Index the boxes of a map that a drone can hit or that can hide a person (all but NO_OBSTACLE_KINDS).
-
-    Sloping ground is included as solid boxes after the map's own: a hillside can collide and hide a person.
-    """
+    """Index the boxes of a map that a drone can hit or that can hide a person (all but NO_OBSTACLE_KINDS)."""
     solid = box_map.select(~box_map.is_any_of(NO_OBSTACLE_KINDS))
-    boxes = solid.centers, solid.half_extents, rotation_matrices(np.radians(solid.rotations_deg))
-    ground = box_map.ground
-    if ground.is_flat:
-        return index_boxes(*boxes)
-    return index_boxes(*map(np.concatenate, zip(boxes, ground.slabs(), strict=True)))
+    return index_boxes(solid.centers, solid.half_extents, rotation_matrices(np.radians(solid.rotations_deg)))
 
 
 def _fill_cells(first: np.ndarray, last: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

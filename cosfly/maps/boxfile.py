@@ -169,7 +169,7 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     header = box_map.header.model_copy(update={**settings, "source": source})
     low, high = box_map.bounds()
     origin = origin_m(low, high, path)
-    if np.abs(origin).max() > FAR_M and header.ground is None:
+    if np.abs(origin).max() > FAR_M:
         log.info("%s: the middle of the map, %s, becomes the origin", path.name, origin[:2].tolist())
         header = header.model_copy(update={"offset_m": dict(zip("xyz", origin.tolist(), strict=True))})
         box_map = replace(box_map, centers=box_map.centers - origin)
@@ -187,7 +187,7 @@ def plausibility(box_map: BoxMap, rows: Sequence[int] = ()) -> str:
     if not len(solid):
         return text
     yaws_deg = solid.rotations_deg[:, 1]
-    feet_m = solid.mins[:, 2] - solid.ground.height_at(solid.centers)
+    feet_m = solid.mins[:, 2] - solid.ground_z_m
     heights_m = 2 * solid.half_extents[:, 2]
     pairs, row_of_box = overlaps(solid), (np.array(rows) if len(rows) else np.arange(len(box_map)))[is_solid]
     overlapping = np.unique(pairs[np.ptp(row_of_box[pairs], axis=1) > 0])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -19,9 +19,8 @@ import shapely
 from pydantic import Field
 from shapely.geometry import Polygon
 
-from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, GroundGrid, MapHeader, MapSource
+from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.formats.meshes import MESHES_FILE, Meshes, MeshRef
-from cosfly.geometry.ground import Ground
 from cosfly.maps.boxlist import BoxList, MapLicence, MapName, origin_m, required
 from cosfly.maps.cityjson_file import CityObject, Surface, read_model
 from cosfly.maps.footprints import (
@@ -72,7 +71,6 @@ class CityBoxes:
     """The boxes of a city model, and the facts about them that its map needs."""
 
     boxes: BoxList = field(default_factory=BoxList)
-    solid_rows: list[int] = field(default_factory=list)  # of boxes that keep their heights on sloping ground
     mesh_refs: dict[int, MeshRef] = field(default_factory=dict)  # by id of a box
     meshes: dict[str, np.ndarray] = field(default_factory=dict)  # by id of an object
     footprint_m2: float = 0.0  # of the buildings
@@ -85,14 +83,7 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     path = cfg.inputs()["city_model"]
     model = read_model(path, cfg.units, cfg.most_skipped)
     objects, origin = _centred(model.objects, path)
-    ground = ground_of(objects)
-
-    def lowered(ring: np.ndarray) -> np.ndarray:
-        return ring - np.outer(ground.height_at(ring), [0.0, 0.0, 1.0])
-
-    if not ground.is_flat:  # heights over the ground below each vertex; solids keep theirs, or their roofs would slope
-        objects = [item if item.rule.form == "solid" else item.moved(lowered) for item in objects]
-    city = _boxes_of(objects, cfg, ground, model.dropped.counts)
+    city = _boxes_of(_flattened(objects), cfg, model.dropped.counts)
     footprint_m2 = city.footprint_m2
     header = MapHeader(
         name=cfg.name, source=MapSource(tool=cfg.tool, version=f"CityJSON {model.version}", file=path.name),
@@ -102,16 +93,11 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
         building_covered_share=round(city.covered_m2 / footprint_m2, 4) if footprint_m2 else None,
         num_objects=model.num_objects, dropped_objects=dict(+model.dropped.counts),
     )  # fmt: skip
-    if not ground.is_flat:
-        header = header.model_copy(update={"ground": GroundGrid.of(ground)})
     box_map = replace(city.boxes.box_map(header), meshes=Meshes(city.mesh_refs, made=city.meshes))
-    if not ground.is_flat:
-        follows = ~np.isin(np.arange(len(box_map)), city.solid_rows)
-        box_map.centers[follows, 2] += ground.height_at(box_map.centers[follows])
     return with_derived_ground(box_map) if cfg.derive_ground else box_map
 
 
-def _boxes_of(objects: list[CityObject], cfg: CityJsonConfig, ground: Ground, dropped: Counter[str]) -> CityBoxes:
+def _boxes_of(objects: list[CityObject], cfg: CityJsonConfig, dropped: Counter[str]) -> CityBoxes:
     """Return the boxes of all objects by the forms of their rules: solid, wall, surface, green.
 
     An object without a box is counted in `dropped`.
@@ -125,9 +111,9 @@ def _boxes_of(objects: list[CityObject], cfg: CityJsonConfig, ground: Ground, dr
         footprint, kind, form = footprints[item.object_id], item.rule.kind, item.rule.form
         num_before = len(city.boxes)
         if form == "solid":
-            _add_solid(city, cfg, item, footprint, ground)
+            _add_solid(city, cfg, item, footprint)
         elif form == "wall":
-            _add_wall(city.boxes, item, footprint, is_flat=ground.is_flat)
+            _add_wall(city.boxes, item, footprint)
         elif kind != "Water":  # all water is added last
             _add_surface(city.boxes, kind, footprint)
             if form == "green" and facets[item.object_id]:
@@ -197,19 +183,18 @@ def _pieces(boxes: BoxList, footprint: Any, tolerance_m: float, **settings: Any)
 SOLID_FILL, SOLID_PIECE_M = 0.9, 3.0
 WALL_FILL, WALL_PIECE_M = 0.6, 1.0
 WALL_MAX_M = 2.5  # highest wall: laser heights are often of trees above
-SLOPED_WALL_M, SLOPED_WALL_DEPTH_M = 6.0, 1.0  # on a slope walls are cut into steps of this length, founded this deep
 SLAB_M = 0.3
 FOOT_M = 0.01  # vertices this near to the lowest one are the solid's foot
 EDGE_M = 0.05  # parts that only touch a rectangle are not over it
 
 
-def _add_solid(city: CityBoxes, cfg: CityJsonConfig, item: CityObject, footprint: Any, ground: Ground) -> None:
-    """Add a solid as upright boxes from its lowest ground (or below it) to its top, and its mesh to draw.
+def _add_solid(city: CityBoxes, cfg: CityJsonConfig, item: CityObject, footprint: Any) -> None:
+    """Add a solid as upright boxes from the ground (or below it) to its top, and its mesh to draw.
 
     A box is as high as the mesh in it, so that planners know its spires.
     """
     z = item.corners()[:, 2]
-    bottom_m = min(float(z.min()), float(ground.height_at(item.corners()).min()))
+    bottom_m = min(float(z.min()), 0.0)
     top_m = max(float(z.max()), float(z.min()) + 0.1)
     mesh = solid_mesh(item.detailed, bottom_m) if cfg.solids else None
     first_row = len(city.boxes)
@@ -221,7 +206,6 @@ def _add_solid(city: CityBoxes, cfg: CityJsonConfig, item: CityObject, footprint
         city.boxes.add(item.rule.kind, rectangle.center, rectangle.size, bottom_m, high_m, rectangle.yaw_deg)
         outlines.append(rectangle_polygon(rectangle))
     rows = range(first_row, len(city.boxes))
-    city.solid_rows += rows
     if mesh is not None and rows:
         city.meshes[item.object_id] = mesh
         ref = MeshRef(file=MESHES_FILE, node=item.object_id, fit="world")
@@ -249,12 +233,11 @@ def solid_mesh(surfaces: list[Surface], foot_m: float) -> np.ndarray | None:
     return corners if len(corners) else None
 
 
-def _add_wall(boxes: BoxList, item: CityObject, footprint: Any, *, is_flat: bool) -> None:
+def _add_wall(boxes: BoxList, item: CityObject, footprint: Any) -> None:
     """Add a wall as boxes that are as high as the upper quartile of its vertices."""
     top_m = float(np.clip(np.percentile(item.corners()[:, 2], 75), 0.3, WALL_MAX_M))
-    longest_m, bottom_m = (np.inf, -SLAB_M) if is_flat else (SLOPED_WALL_M, -SLOPED_WALL_DEPTH_M)
-    for piece in _pieces(boxes, footprint, 0.02, min_fill=WALL_FILL, min_size_m=WALL_PIECE_M, max_size_m=longest_m):
-        boxes.add(item.rule.kind, piece.center, piece.size, bottom_m, top_m, piece.yaw_deg)
+    for piece in _pieces(boxes, footprint, 0.02, min_fill=WALL_FILL, min_size_m=WALL_PIECE_M):
+        boxes.add(item.rule.kind, piece.center, piece.size, -SLAB_M, top_m, piece.yaw_deg)
 
 
 def _top_within(mesh: np.ndarray, rectangle: Rectangle, default: float) -> float:
@@ -398,37 +381,45 @@ def _grown(is_free: np.ndarray, x: int, y: int) -> tuple[int, int, int, int]:
 # Surfaces that people walk on at the file's height. Not water, which is lower than its banks, nor green, with the
 # canopy in its vertices.
 TERRAIN_KINDS = ("Roads", "Sidewalks", "Ground", "Terrain", "RailTrack")
-FLAT_WITHIN_M = 3.0  # ground that rises less over the whole map is made flat
-REPORTED_RISE_M = 1.0  # a smaller rise is kerbs and steps: made flat without a warning
+FLAT_WITHIN_M = 3.0  # ground that rises less over the whole map keeps its heights
+REPORTED_RISE_M = 1.0  # a smaller rise is kerbs and steps
 RISE_SHARES = (2, 98)  # percentiles: a few stray vertices do not tilt a town
-GROUND_CELL_M, MOST_NODES = 4.0, 250_000  # cell of the heights of sloping ground; grown for vast models
 SAME_PLACE_M = 0.1  # vertices nearer than this are one, at their mean height
 
 
-def ground_of(objects: list[CityObject]) -> Ground:
-    """Return the ground of a city model with its usual height at 0: flat, or a grid of heights."""
+def _flattened(objects: list[CityObject]) -> list[CityObject]:
+    """Lower the objects by the height of the ground, so that it is flat at 0.
+
+    Surfaces are lowered vertex by vertex. A solid is lowered as a whole, by the lowest ground below it, or its roof
+    would slope.
+    """
     terrain = [item.corners() for item in objects if item.rule.form == "surface" and item.rule.kind in TERRAIN_KINDS]
     if terrain:
         samples = np.concatenate(terrain)
-        origin = "terrain and streets"
-    else:
+    else:  # the bases of buildings
         solids = [item for item in objects if item.rule.form == "solid"] or objects
         ends = [(item.corners().min(axis=0), item.corners().max(axis=0)) for item in solids]
         samples = np.array([[*(first + last)[:2] / 2, first[2]] for first, last in ends])
-        origin = "the bases of buildings"
     rise_m = float(np.ptp(np.percentile(samples[:, 2], RISE_SHARES)))
+    if rise_m > REPORTED_RISE_M:
+        log.warning("the ground rises by %.1f m; the map is made flat", rise_m)
     if rise_m <= FLAT_WITHIN_M:
-        if rise_m > REPORTED_RISE_M:
-            log.warning("the ground rises by %.1f m, at most %g m, so it is made flat", rise_m, FLAT_WITHIN_M)
-        return Ground.flat(0.0)
-    bounds = np.concatenate([item.corners()[:, :2] for item in objects])
-    ground = _gridded(samples, bounds.min(axis=0), bounds.max(axis=0))
-    log.info("the ground rises by %.1f m; its heights are sampled every %g m from %s", rise_m, ground.cell_m, origin)
-    return GroundGrid.of(ground).ground()  # with heights rounded as in the file, so that boxes stand on those
+        return objects
+    ground_m = _heights_between(samples)
+    up = np.array([0.0, 0.0, 1.0])
+
+    def lowered(item: CityObject) -> CityObject:
+        if item.rule.form != "solid":
+            return item.moved(lambda ring: ring - np.outer(ground_m(ring), up))
+        lowest_m = ground_m(item.corners()).min()
+        return item.moved(lambda ring: ring - lowest_m * up)
+
+    return [lowered(item) for item in objects]
 
 
-def _gridded(samples: np.ndarray, low: np.ndarray, high: np.ndarray) -> Ground:
-    """Return a grid of heights over a rectangle: linear between samples, and that of the nearest sample beyond them."""
+def _heights_between(samples: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the function from places, (n, 2 or 3), to heights, (n,): linear between samples, (k, 3), and that of the
+    nearest sample beyond them."""
     # Imported here: half a second that every command would spend for the settings of the maps.
     from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
     from scipy.spatial import QhullError
@@ -436,17 +427,15 @@ def _gridded(samples: np.ndarray, low: np.ndarray, high: np.ndarray) -> Ground:
     places, group = np.unique(np.round(samples[:, :2] / SAME_PLACE_M), axis=0, return_inverse=True)
     heights = np.bincount(group.ravel(), samples[:, 2]) / np.bincount(group.ravel())
     places *= SAME_PLACE_M
-    cell_m = GROUND_CELL_M
-    while np.prod((high - low) / cell_m + 2) > MOST_NODES:
-        cell_m *= 2.0
-    west_south = np.floor(low / cell_m) * cell_m
-    num_x, num_y = (np.ceil((high - west_south) / cell_m).astype(int) + 1).clip(2).tolist()
-    x, y = np.meshgrid(west_south[0] + cell_m * np.arange(num_x), west_south[1] + cell_m * np.arange(num_y))
-    nodes = np.column_stack([x.ravel(), y.ravel()])
-    node_heights = NearestNDInterpolator(places, heights)(nodes)
+    nearest = NearestNDInterpolator(places, heights)
     try:
-        linear = LinearNDInterpolator(places, heights)(nodes)
-        node_heights = np.where(np.isnan(linear), node_heights, linear)
+        linear = LinearNDInterpolator(places, heights)
     except QhullError:  # too few samples, or all on one line
         log.warning("the %d ground samples span no area, so heights are those of the nearest sample", len(places))
-    return Ground(node_heights.reshape(num_y, num_x), float(west_south[0]), float(west_south[1]), cell_m)
+        linear = nearest
+
+    def heights_at(points: np.ndarray) -> np.ndarray:
+        between = linear(points[:, :2])
+        return np.where(np.isnan(between), nearest(points[:, :2]), between)
+
+    return heights_at

@@ -243,7 +243,7 @@ def with_derived_ground(box_map: BoxMap) -> BoxMap:
         size = house.size[0] + 2 * PAVEMENT_M, house.size[1] + 2 * PAVEMENT_M
         boxes.add("Sidewalks", house.center, size, -GROUND_SLAB_M, 0.0, house.yaw_deg)
     derived = boxes.box_map()
-    derived.centers[:, 2] += box_map.ground.height_at(derived.centers)
+    derived.centers[:, 2] += box_map.ground_z_m
     derived.ids[:] = np.setdiff1d(np.arange(1, len(box_map) + len(derived) + 1), box_map.ids)[: len(derived)]
     header = box_map.header
     update = {

@@ -17,7 +17,6 @@ import numpy as np
 from cosfly.formats.bystanders import Bystander, Bystanders
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.geometry.axes import headings_of
-from cosfly.geometry.ground import Ground
 from cosfly.pedestrians.lanes import Lane
 from cosfly.pedestrians.speed_model import (
     PACES,
@@ -58,7 +57,7 @@ class Trip:
     limits_mps: np.ndarray
     head_start_s: float = 0.0
 
-    def moved(self, along_m: np.ndarray, time_s: np.ndarray, heights: Ground) -> Bystander:
+    def moved(self, along_m: np.ndarray, time_s: np.ndarray, ground_z_m: float) -> Bystander:
         """Return the positions and headings at distances along the route, (n,) m, which are reached at times (n,)."""
         positions_m = self.at(along_m)
         if self.kind == "Car":
@@ -66,7 +65,7 @@ class Trip:
             headings_rad = np.arctan2(chord[:, 1], chord[:, 0])
         else:
             headings_rad = headings_of(positions_m, time_s)
-        return Bystander(self.kind, np.column_stack([positions_m, heights.height_at(positions_m)]), headings_rad)
+        return Bystander(self.kind, np.insert(positions_m, 2, ground_z_m, axis=1), headings_rad)
 
     @cached_property
     def timed(self) -> TimedRoute:
@@ -123,18 +122,18 @@ def bystanders_of(
                     trip = _draw_car(target, lanes, cfg, rng)
                 else:
                     trip = _draw_pedestrian(target, number, ground, cfg, rng)
-                bystander = None if trip is None else avoid_collisions(trip, target.time_s, placed, ground.heights)
+                bystander = None if trip is None else avoid_collisions(trip, target.time_s, placed, ground.z_m)
                 if bystander is not None:
                     placed.append(replace(bystander, is_look_alike=not is_car and number < cfg.look_alikes))
                     break
     return Bystanders(target.path_id, placed[1:])
 
 
-def avoid_collisions(trip: Trip, time_s: np.ndarray, placed: list[Bystander], heights: Ground) -> Bystander | None:
+def avoid_collisions(trip: Trip, time_s: np.ndarray, placed: list[Bystander], ground_z_m: float) -> Bystander | None:
     """Return the motion of a trip that waits for those already placed; None where waiting does not help."""
     for _ in range(MOST_WAITS + 1):
         along_m = trip.along_m(time_s)
-        bystander = trip.moved(along_m, time_s, heights)
+        bystander = trip.moved(along_m, time_s, ground_z_m)
         collisions = np.flatnonzero(gaps_m(bystander, placed) < 0.0)
         if len(collisions) == 0:
             return bystander

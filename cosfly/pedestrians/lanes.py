@@ -71,7 +71,7 @@ def lanes_of(box_map: BoxMap) -> list[Lane]:
     obstacles = obstacle_index(box_map)
 
     def is_free(points_m: np.ndarray) -> bool:
-        places = np.column_stack([points_m, box_map.ground.height_at(points_m) + CAR_MIDDLE_M])
+        places = np.insert(points_m, 2, box_map.ground_z_m + CAR_MIDDLE_M, axis=1)
         is_clear = signed_distances(obstacles, places, CLEAR_M)[0] >= CLEAR_M
         return bool(_on_road(roads, points_m).all() and is_clear.all())
 

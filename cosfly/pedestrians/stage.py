@@ -22,7 +22,6 @@ from cosfly.formats.boxes import read_boxes
 from cosfly.formats.bystanders import BYSTANDERS_FILE, Bystanders, write_bystanders
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory, pace_field, paces_of, walk_id, write_paths
 from cosfly.formats.roi import read_roi
-from cosfly.geometry.ground import Ground
 from cosfly.pedestrians.astar import route_cost
 from cosfly.pedestrians.bystanders import bystanders_of
 from cosfly.pedestrians.lanes import Lane, lanes_of
@@ -68,12 +67,12 @@ def make_pedestrian(
     pace_rng = rng.spawn(1)[0]  # a child takes no draw from its parent: shares of paces change no route
     route_m, retries = _draw_route(path_id, ground, cfg, rng, seconds)
     with timed(seconds, "report"):
-        trajectory = follow_route(path_id, route_m, ground.heights, cfg, rng, pace_rng, pace)
+        trajectory = follow_route(path_id, route_m, ground.z_m, cfg, rng, pace_rng, pace)
     return PedestrianResult(trajectory, retries, dict(seconds))
 
 
 def follow_route(
-    path_id: str, route_m: np.ndarray, heights: Ground, cfg: PedestriansConfig, rng: np.random.Generator,
+    path_id: str, route_m: np.ndarray, ground_z_m: float, cfg: PedestriansConfig, rng: np.random.Generator,
     pace_rng: np.random.Generator, pace: str | None = None,
 ) -> PedestrianTrajectory:  # fmt: skip
     """Return the trajectory along a route, (k, 2) m, at a pace; None: one that is drawn by its share."""
@@ -81,7 +80,7 @@ def follow_route(
     route = take_pace(route_m, PACES[name], pace_rng)
     timed_route = TimedRoute(route.polyline_m, speeds_at(route, PACES[name], cfg, rng), route.stops_s)
     time_s, positions_m, speeds_mps = timed_route.resample(cfg.dt_s)
-    on_ground = np.column_stack([positions_m, heights.height_at(positions_m)])
+    on_ground = np.insert(positions_m, 2, ground_z_m, axis=1)
     return PedestrianTrajectory(path_id, route.polyline_m, time_s, on_ground, speeds_mps, name)
 
 

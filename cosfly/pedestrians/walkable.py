@@ -26,7 +26,6 @@ from cosfly.formats.pedestrian_paths import PLAIN_PACE, PedestrianTrajectory
 from cosfly.formats.roi import Roi
 from cosfly.geometry import grid as grids
 from cosfly.geometry.axes import DT_S
-from cosfly.geometry.ground import Ground
 from cosfly.pedestrians.astar import find_route
 from cosfly.pedestrians.speed_model import PACES, SLOWEST_SPEED_MPS
 from cosfly.runtime.compiled import njit
@@ -37,9 +36,8 @@ log = logging.getLogger(__name__)
 
 # Least share of surfaces in the free cells of a map without paved ones; below, they are lawns between unnamed streets.
 SURFACE_SHARE_MIN = 0.5
-OFF_GROUND_SHARE_MAX = 0.1  # more ground boxes off the header's ground indicate a slope
+OFF_GROUND_SHARE_MAX = 0.1  # more ground boxes off the header's ground indicate a slope or a wrong height
 ROI_SHARE_MIN = 0.5  # of a region of interest that lies on the map; below, it belongs to another map
-SLOPE_MAX = 0.58  # rise over run, 30 degrees: as steep as stairs
 
 # Footings of cells. In a map that marks crossings, a crossing is carriageway under stripes: after gaps below GAP_M are
 # closed, its paint is MARKED_M wide in every direction, unlike dashes and edge lines. In other maps, carriageway may be
@@ -141,15 +139,15 @@ class WalkableGround:
     """The walkable ground of a map.
 
     grid: The obstacles before inflation. inflated: After it. parts: (ny, nx) int32, one number for cells with a route
-    between them, 0 for cells that are not walkable: obstacles, outside the region of interest, steep ground, small
-    components. footing: (ny, nx) uint8. heights: Of the ground. costs: Of footings, for routes.
+    between them, 0 for cells that are not walkable: obstacles, outside the region of interest, small components.
+    footing: (ny, nx) uint8. z_m: Height of the ground. costs: Of footings, for routes.
     """
 
     grid: grids.OccupancyGrid
     inflated: grids.OccupancyGrid
     parts: np.ndarray
     footing: np.ndarray
-    heights: Ground
+    z_m: float
     costs: np.ndarray
     is_in_roi: np.ndarray | None = None
     counts: dict[str, Any] = field(default_factory=dict)
@@ -241,12 +239,7 @@ def walkable_ground(
         free = ~inflated.occupied
         num_free = _count(free)
         has_surface = _surface(box_map, cfg.ground, grid, free)
-        is_steep = None
-        if not box_map.ground.is_flat:
-            columns, rows = np.meshgrid(*(np.arange(size) for size in grid.size))
-            slopes = box_map.ground.slope_at(grid.centers_of(np.stack([columns.ravel(), rows.ravel()], axis=1)))
-            is_steep = (slopes > SLOPE_MAX).reshape(free.shape)
-        for mask in (has_surface, is_in_roi, None if is_steep is None else ~is_steep):
+        for mask in (has_surface, is_in_roi):
             if mask is not None:
                 free &= mask
     counts: dict[str, Any] = {
@@ -256,7 +249,7 @@ def walkable_ground(
         "ground": cfg.ground if has_surface is not None else "anywhere",
         "cells_with_surface": None if has_surface is None else _count(has_surface),
         "cells_in_roi": None if is_in_roi is None else _count(is_in_roi),
-        **({} if is_steep is None else {"cells_steep": _count(is_steep)}), "cells_walkable": _count(free),
+        "cells_walkable": _count(free),
     }  # fmt: skip
     _check_walkable(counts, where, roi_where)
     with timed(seconds, "connectivity"):
@@ -268,7 +261,7 @@ def walkable_ground(
     with timed(seconds, "footing"):
         costs = costs_of(cfg.open_cost, cfg.road_cost)
         footing = footing_of(box_map, grid)
-    ground = WalkableGround(grid, inflated, parts, footing, box_map.ground, costs, is_in_roi, counts)
+    ground = WalkableGround(grid, inflated, parts, footing, box_map.ground_z_m, costs, is_in_roi, counts)
     if not ground.row_ends[-1]:
         raise NoPathError(
             "all walkable ground is road, but pedestrian trajectories must start and end off the road", where=where,
@@ -297,8 +290,7 @@ def _surface(box_map: BoxMap, ground: str, grid: grids.OccupancyGrid, free: np.n
     num_all = _count(box_map.is_any_of(GROUND_KINDS))
     if num_off > OFF_GROUND_SHARE_MAX * num_all:
         log.warning(
-            "%s: %d of %d ground boxes lie more than %g m off the ground of its header and are not walkable; "
-            "if the map slopes, its header needs heights (ground)",
+            "%s: %d of %d ground boxes lie more than %g m off ground_z_m of its header and are not walkable",
             box_map.name, num_off, num_all, grids.SURFACE_REACH_M,
         )  # fmt: skip
     if has_ground is None:

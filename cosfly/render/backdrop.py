@@ -45,7 +45,7 @@ def draw_backdrop(cfg: RenderConfig, box_map: BoxMap, view: TopView) -> np.ndarr
             for left in range(0, width, side_px):
                 middle_m = np.array([left + side_px / 2.0, -top - side_px / 2.0]) / view.pixels_per_m
                 middle_m += [view.west_m, view.north_m]
-                place_m = np.append(middle_m, box_map.ground.height_at(middle_m[None])[0])
+                place_m = np.append(middle_m, box_map.ground_z_m)
                 eye_m = np.add(place_m, [0.0, 0.0, HEIGHT_M])
                 renderer.prepare(place_m - side_m / 2.0, eye_m + side_m / 2.0)
                 pose = world_from_camera(eye_m, NORTH_UP_DEG)

@@ -5,7 +5,7 @@ All renderers draw the same things in the same places, so that depth, kinds and 
 - every box, or something of its kind that stays inside it, with its id of `instance_ids`; the person with PERSON_ID;
   bystanders, people and cars, each with its own id from the caller (`other_id`);
 - of a tree that is one box a stem, and foliage only from `crown_low` of `plants_of` up: people walk under it;
-- a ground plane of Terrain (`ground_plane`) or sloping ground (surfaces.py), with NO_INSTANCE; sky where nothing is
+- a ground plane of Terrain (`ground_plane`), with NO_INSTANCE; sky where nothing is
   between NEAR_M and FAR_M (`far_as_sky`);
 - of coplanar surfaces the one of the higher layer, and within a layer always the same one.
 """
@@ -188,9 +188,7 @@ def scene_origin(box_map: BoxMap) -> np.ndarray:
 
 
 def plane_z_m(box_map: BoxMap) -> float:
-    """Return the height of the ground plane: the map's own, at most that of the lowest slab; on a slope the minimum."""
-    if not box_map.ground.is_flat:
-        return float(box_map.ground.heights_m.min())
+    """Return the height of the ground plane: the map's own, at most that of the lowest slab."""
     tops = box_map.maxs[np.isin(box_map.kinds, list(GROUND_KINDS)), 2]
     return float(tops.min(initial=box_map.header.ground_z_m))
 

@@ -130,7 +130,6 @@ class Surroundings:
 
     def __init__(self, box_map: BoxMap) -> None:
         self.obstacles = obstacle_index(box_map)
-        self._ground = box_map.ground
         slabs = box_map.select(np.isin(box_map.kinds, sorted(GROUND_KINDS)))
         self._centers = slabs.centers
         self._half = slabs.half_extents
@@ -142,19 +141,14 @@ class Surroundings:
     def surface_z_m(self, x_m: float, y_m: float, near_z_m: float) -> float:
         """Return the height of the surface at a place, m.
 
-        On sloped ground it is the height of the ground. On flat ground it is the highest slab within STEP_UP_M of
-        `near_z_m`, or `near_z_m` itself if there is none.
+        It is that of the highest slab within STEP_UP_M of `near_z_m`, or `near_z_m` itself if there is none.
         """
-        if not self._ground.is_flat:
-            return float(self._ground.height_at(np.array([[x_m, y_m]]))[0])
         over = self._slabs_at(x_m, y_m) & (np.abs(self._tops - near_z_m) <= STEP_UP_M)
         return float(self._tops[over].max()) if over.any() else near_z_m
 
     def below_ground_m(self, position_m: np.ndarray) -> float:
-        """Return how far a position, (3,), is below the top of the ground's slabs or slope, m; 0 above it."""
+        """Return how far a position, (3,), is below the top of the ground's slabs, m; 0 above it."""
         x_m, y_m, z_m = position_m.tolist()
-        if not self._ground.is_flat:
-            return max(0.0, float(self._ground.height_at(position_m[None])[0]) - z_m)
         inside = self._slabs_at(x_m, y_m) & (self._bottoms < z_m)
         return max(0.0, self._plane_m - z_m, float(self._tops[inside].max(initial=-np.inf)) - z_m)
 

@@ -21,7 +21,7 @@ from cosfly.geometry.axes import rotation_matrices, rotation_matrix
 from cosfly.render import contract
 from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, Others, PosedBystander, PosedPerson
 from cosfly.render.person import figure_of
-from cosfly.render.surfaces import are_solids, drape, is_draped, layers_of, solids_of
+from cosfly.render.surfaces import are_solids, layers_of, solids_of
 from cosfly.runtime.errors import EnvironmentMissing, RenderError
 
 SKY_COLOR = np.array([0.52, 0.64, 0.78])  # also the haze's, linear RGB like all colours here
@@ -179,7 +179,7 @@ def _tags(kinds: np.ndarray, ids: np.ndarray, layers: np.ndarray) -> np.ndarray:
 
 
 def _map_triangles(box_map: BoxMap, origin: np.ndarray, num_others: int) -> Triangles:
-    """Return the triangles of every box, solid and draped surface of a map, and of its ground plane."""
+    """Return the triangles of every box and solid of a map, and of its ground plane."""
     import trimesh
 
     plane_center, plane_half = contract.ground_plane(box_map)
@@ -194,7 +194,7 @@ def _map_triangles(box_map: BoxMap, origin: np.ndarray, num_others: int) -> Tria
     tags = _tags(kinds, ids, np.append(layers_of(box_map), 0))
     crowns, stems = _trees(box_map, centers, halves, colors)
     is_box = np.append(~are_solids(box_map), True)
-    is_plain = ~crowns.rows & ~np.append(is_draped(box_map), False)
+    is_plain = ~crowns.rows
     box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
     pieces = []
     for solid in (UnitSolids(box, is_plain, halves, np.zeros(len(kinds)), colors), crowns, stems):
@@ -207,9 +207,6 @@ def _map_triangles(box_map: BoxMap, origin: np.ndarray, num_others: int) -> Tria
     placed = solids_of(box_map)
     for sides in (placed.corners_m, placed.corners_m[:, ::-1]):  # seen from both
         pieces.append((sides - origin, colors[placed.rows], tags[placed.rows]))
-    if not box_map.ground.is_flat:
-        draped = drape(box_map)  # the last row, BARE_GROUND, is the plane's
-        pieces.append((draped.corners_m - origin, colors[draped.rows], tags[draped.rows]))
     corners_m, colors, tags = map(np.concatenate, zip(*pieces, strict=True))
     return corners_m, colors, tags
 

@@ -217,7 +217,7 @@ class UnrealCvRenderer(SimulatorRenderer):
         found_m[2] -= self._cfg.coord_z_offset
         if np.linalg.norm(found_m - position_m) > SAME_PLACE_M:
             both = np.stack([found_m, position_m])
-            over_m = both[:, 2] - self._map.ground.height_at(both)
+            over_m = both[:, 2] - self._map.ground_z_m
             heights = zip(both.round(2).tolist(), over_m, strict=True)
             got, expected = (f"{point}, {over:.1f} m over the ground" for point, over in heights)
             what = "the camera is not at the requested position"

@@ -240,7 +240,7 @@ def _merge_groups(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
     True are trees with stems, apart from bushes below the cut, and boxes over a passage or an arcade, apart from boxes
     on a box below: a merge would close the passage.
     """
-    cut_m = _ground_z_m(box_map) + cfg.cut_height_m
+    cut_m = box_map.ground_z_m + cfg.cut_height_m
     mins, maxs = box_map.mins, box_map.maxs
     is_plant = box_map.kinds == VEGETATION
     is_low = mins[:, 2] <= cut_m
@@ -251,20 +251,14 @@ def _merge_groups(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
     return is_built_over | (is_plant & (maxs[:, 2] > cut_m) & _has_stems(cfg))
 
 
-def _ground_z_m(box_map: BoxMap) -> np.ndarray:
-    """Return the height of the ground under the middle of each box, (n,) m."""
-    return box_map.ground.height_at(box_map.centers)
-
-
 def _has_stems(cfg: SimplifyConfig) -> bool:
     return cfg.crop_tree and cfg.crop_strategy == "fixed" and cfg.trunk == "stem"
 
 
-def _spanning(box_map: BoxMap, cfg: SimplifyConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of vegetation that spans the cut, (k,), and the height of the cut at each, (k,) m."""
-    cut = _ground_z_m(box_map) + cfg.cut_height_m
-    rows = np.flatnonzero((box_map.kinds == VEGETATION) & (box_map.mins[:, 2] < cut) & (box_map.maxs[:, 2] > cut))
-    return rows, cut[rows]
+def _spanning(box_map: BoxMap, cfg: SimplifyConfig) -> tuple[np.ndarray, float]:
+    """Return the rows of vegetation that spans the cut, (k,), and the height of the cut, m."""
+    cut = box_map.ground_z_m + cfg.cut_height_m
+    return np.flatnonzero((box_map.kinds == VEGETATION) & (box_map.mins[:, 2] < cut) & (box_map.maxs[:, 2] > cut)), cut
 
 
 def _upright(box_map: BoxMap, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -279,7 +273,7 @@ def _feet(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
     the merge, because a merged grove still has one stem for each of its trees."""
     rows, _ = _spanning(box_map, cfg)
     # A box that hangs above the ground is a part of a crown, not a tree, unless it comes down to a metre.
-    rows = rows[box_map.mins[rows, 2] <= _ground_z_m(box_map)[rows] + 1.0]
+    rows = rows[box_map.mins[rows, 2] <= box_map.ground_z_m + 1.0]
     half = np.minimum(box_map.half_extents[rows, :2].min(axis=1), cfg.stem_radius_m)
     return np.column_stack([box_map.centers[rows, :2], half, half])
 
@@ -307,7 +301,7 @@ def crop_tree(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray, feet: 
         places, widths, turns = feet[:, :2], feet[:, 2:], np.zeros((len(feet), 3))
     count = len(places)
     trunks = BoxMap(
-        np.column_stack([places, box_map.ground.height_at(places) + cfg.cut_height_m / 2]),
+        np.column_stack([places, np.full(count, box_map.ground_z_m + cfg.cut_height_m / 2)]),
         np.column_stack([widths, np.full(count, cfg.cut_height_m / 2)]),
         turns, np.full(count, VEGETATION, dtype=np.uint8), _free_ids(used_ids, count),
     )  # fmt: skip
@@ -323,19 +317,19 @@ def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarra
 
     Source: app:simworld:step3, "crop_tree".
     """
-    ground_z_m = _ground_z_m(box_map)
+    ground_z_m = box_map.ground_z_m
     split = ground_z_m + cfg.split_z_m
     low, high = box_map.mins[:, 2], box_map.maxs[:, 2]
     is_tall = (box_map.kinds == VEGETATION) & (high - np.maximum(low, ground_z_m) > cfg.adaptive_height_m)
     rows, keeps, lows, highs = [], list[bool](), [], []
     for row in np.flatnonzero(is_tall):
         cuts = [float(low[row])]
-        if low[row] < split[row] < high[row]:
-            cuts.append(float(split[row]))
+        if low[row] < split < high[row]:
+            cuts.append(split)
         num_pieces = int(np.ceil((high[row] - cuts[-1]) / cfg.adaptive_height_m - 1e-9))
         cuts += np.linspace(cuts[-1], high[row], num_pieces + 1)[1:].tolist()
         rows += [row] * (len(cuts) - 1)
-        has_stem = len(cuts) > 2 and low[row] < split[row]
+        has_stem = len(cuts) > 2 and low[row] < split
         id_piece = 1 if has_stem else 0
         keeps += [piece == id_piece for piece in range(len(cuts) - 1)]
         lows += cuts[:-1]
@@ -344,7 +338,7 @@ def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarra
     is_new = ~np.array(keeps, dtype=bool)
     low_z, high_z = np.array(lows), np.array(highs)
     half, turns = _upright(box_map, pieces)
-    is_stem = ((low_z < split[pieces]) & (low_z <= ground_z_m[pieces] + 1.0))[:, None]
+    is_stem = ((low_z < split) & (low_z <= ground_z_m + 1.0))[:, None]
     half[:, :2] = np.where(is_stem, np.minimum(half[:, :2], cfg.cell_size_m / 2), half[:, :2])
     half[:, 2] = (high_z - low_z) / 2
     ids = box_map.ids[pieces].copy()
@@ -367,7 +361,7 @@ def crop_below_ground(box_map: BoxMap, *, clip: bool = False) -> BoxMap:
         clip: also cut off the parts of upright boxes, except surfaces, below the ground, and drop boxes that only just
             reach it (app:simworld:step3). A tilted box has no lower part that is a box, and stays whole.
     """
-    ground_z_m = _ground_z_m(box_map)
+    ground_z_m = box_map.ground_z_m
     is_surface = box_map.is_any_of(SURFACE_KINDS)
     lows, tops = box_map.mins[:, 2], box_map.maxs[:, 2]
     if not clip:
@@ -375,8 +369,8 @@ def crop_below_ground(box_map: BoxMap, *, clip: bool = False) -> BoxMap:
     is_upright = (box_map.rotations_deg[:, [0, 2]] == 0).all(axis=1)
     is_cut = (lows < ground_z_m) & (tops > ground_z_m) & is_upright & ~is_surface
     centers, half_extents = box_map.centers.copy(), box_map.half_extents.copy()
-    centers[is_cut, 2] = (tops[is_cut] + ground_z_m[is_cut]) / 2
-    half_extents[is_cut, 2] = (tops[is_cut] - ground_z_m[is_cut]) / 2
+    centers[is_cut, 2] = (tops[is_cut] + ground_z_m) / 2
+    half_extents[is_cut, 2] = (tops[is_cut] - ground_z_m) / 2
     clipped = replace(box_map, centers=centers, half_extents=half_extents)
     return clipped.select((tops > ground_z_m) | is_surface)
 

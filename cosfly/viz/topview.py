@@ -65,8 +65,6 @@ def draw_map(box_map: BoxMap, view: TopView) -> np.ndarray:
     """Draw a map from above, low boxes first, high ones lighter; (height, width, 3) uint8 RGB."""
     picture = np.full((*view.size_px[::-1], 3), PAPER, dtype=np.uint8)
     tops = box_map.centers[:, 2] + box_map.half_extents[:, 2]
-    if not box_map.ground.is_flat:
-        tops -= box_map.ground.height_at(box_map.centers)
     for row in np.argsort(tops, kind="stable"):
         outline = view.pixels(footprint(box_map, row))
         color = np.array(COLORS.get(KIND_NAMES[int(box_map.kinds[row])], OTHER_COLOR), dtype=np.float64)

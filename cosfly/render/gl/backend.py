@@ -206,13 +206,8 @@ class GlRenderer:
         share = np.frombuffer(texture.read(alignment=1), np.float32).reshape(HEIGHT_SIZE_PX, HEIGHT_SIZE_PX)
         target.release()
         texture.release()
-        base: np.ndarray | float = self._ground_z
-        if not self.scene.ground.is_flat:
-            x, y = (low[k] + self.origin_m[k] + pixel_m * (np.arange(HEIGHT_SIZE_PX) + 0.5) for k in (0, 1))
-            places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-            base = self.scene.ground.height_at(places).reshape(HEIGHT_SIZE_PX, HEIGHT_SIZE_PX) - self.origin_m[2]
-        heights = np.where(share >= 1.0, base, (top - share * depth_m).astype(np.float32))
-        heights = np.minimum(heights, base + TALLEST_AMBIENT_M).astype(np.float32)
+        heights = np.where(share >= 1.0, self._ground_z, (top - share * depth_m).astype(np.float32))
+        heights = np.minimum(heights, self._ground_z + TALLEST_AMBIENT_M).astype(np.float32)
         heights = cv2.GaussianBlur(heights, (0, 0), max(AMBIENT_BLUR_M / pixel_m, 0.5))
         self._height.write(np.ascontiguousarray(heights).tobytes())
         self._area["height_area"] = np.array([*low, 0.5 / half, 0.5 / half])

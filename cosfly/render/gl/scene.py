@@ -1,4 +1,4 @@
-"""A map ready to be drawn: the parts of every box, the ground plane, surfaces on sloping ground, meshes, and lamps."""
+"""A map ready to be drawn: the parts of every box, the ground plane, meshes, and lamps."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from scipy.spatial.transform import Rotation
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KINDS
 from cosfly.geometry.axes import rotation_matrices
-from cosfly.geometry.ground import Ground
 from cosfly.render import contract
 from cosfly.render.contract import LAYER_STEP, NO_INSTANCE, STANDING_LAYER, seeds_of
 from cosfly.render.gl import meshes, parts
-from cosfly.render.gl.parts import LOOSE_VERTEX, PART, Boxes, LooseTriangles, Parts, materials_of
+from cosfly.render.gl.parts import LOOSE_VERTEX, Boxes, LooseTriangles, Parts
 from cosfly.render.gl.shapes import BUILDING_COLORS, PLAIN_COLORS, TILE_COLORS, parts_of
-from cosfly.render.surfaces import Solids, Triangles, are_solids, drape, is_draped, layers_of, solids_of
+from cosfly.render.surfaces import Solids, are_solids, layers_of, solids_of
 
 # --- solids -----------------------------------------------------------------------------------------------------------
 # The triangles of meshes. Buildings get walls with storeys and windows, flat roofs, and tiles on sloping roofs; meshes
@@ -172,7 +171,7 @@ def lamps_along_streets(box_map: BoxMap) -> np.ndarray:
     for first, second in sorted(map(tuple, pairs)):
         stays[second] &= not stays[first]
     places = places[stays]
-    places[:, 2] = np.maximum(places[:, 2], box_map.ground.height_at(places)) + HIGH_M
+    places[:, 2] = np.maximum(places[:, 2], box_map.ground_z_m) + HIGH_M
     return places
 
 
@@ -188,8 +187,7 @@ class Scene:
     parts: Parts
     origin_m: np.ndarray  # (3,) world position of the origin of the parts
     plane_z_m: float  # height of the ground plane, world
-    ground: Ground
-    loose: LooseTriangles  # surfaces on sloping ground, and the meshes of boxes
+    loose: LooseTriangles  # the meshes of boxes
     lamps: np.ndarray  # (n, 3) relative to the origin; only for a map without lamps among its parts
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -205,11 +203,7 @@ def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
     all_ids = contract.instance_ids(box_map, num_others)
     are_meshes = are_solids(box_map)
     all_parts = list[Parts]()
-    lies = is_draped(box_map) & ~are_meshes
-    # Surfaces on a slope are built on a plane, so that they find their neighbours, and lifted afterwards.
     centers = box_map.centers - origin
-    centers[lies, 2] -= box_map.ground.height_at(box_map.centers[lies])
-    lying = np.zeros(len(box_map) + 1, PART)  # the last is the ground plane
     tiers = layers_of(box_map) % 1.0
     seeds = seeds_of(box_map.ids)
     turns = rotation_matrices(np.radians(box_map.rotations_deg))
@@ -219,39 +213,13 @@ def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
     for kind in np.unique(box_map.kinds[~are_meshes]).tolist():
         rows = np.flatnonzero((box_map.kinds == kind) & ~are_meshes)
         boxes = Boxes(centers[rows], half[rows], turns[rows], all_ids[rows], seeds[rows], kind, tiers[rows])
-        kind_parts = parts_of(boxes)
-        if lies[rows].any():  # surfaces have one part each
-            lying[rows] = kind_parts[0].records
-            kind_parts = [kind_parts[0].select(~lies[rows])]
-        all_parts += kind_parts
+        all_parts += parts_of(boxes)
     center, half_m = contract.ground_plane(box_map)
     ids = np.full(1, NO_INSTANCE, np.uint16)
     zero = np.zeros(1)  # seed and tier
     plane = Boxes((center - origin)[None], half_m[None], np.eye(3)[None], ids, zero, KINDS["Terrain"], zero)
     all_parts.append(plane.part(meshes.BOX, half_m[None], parts.GRASS, (0.105, 0.14, 0.045), layer=0))
-    lying[-1] = all_parts[-1].records
     loose = loose_solids(box_map, solids_of(box_map), origin, all_ids)
-    if not box_map.ground.is_flat:
-        loose.vertices.update(_draped(drape(box_map), origin, lying))
     all_drawn = Parts.concatenate(all_parts)
     lamps = np.zeros((0, 3)) if len(all_drawn.lamps()) else lamps_along_streets(box_map) - origin
-    return Scene(all_drawn, origin, contract.plane_z_m(box_map), box_map.ground, loose, lamps)
-
-
-def _draped(draped: Triangles, origin: np.ndarray, records: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the vertices of draped triangles by material, in the axes of their boxes, in which shaders draw lanes.
-
-    Args:
-        records: (n + 1,) PART of the map's boxes; the last is the bare ground's.
-    """
-    triangle_records = records[draped.rows]  # BARE_GROUND is -1, the last
-    axes = Rotation.from_quat(triangle_records["quaternion"].astype(np.float64)).inv().as_matrix()
-    half = triangle_records["half"].astype(np.float64)
-    local = np.einsum("kij,kcj->kci", axes, draped.corners_m - origin - triangle_records["center"][:, None])
-    vertices = np.zeros((len(triangle_records), 3), LOOSE_VERTEX)
-    vertices["position"] = local / half[:, None]
-    vertices["normal"] = (np.einsum("kij,kj->ki", axes, draped.normals) * half)[:, None]
-    for name in PART.names or ():
-        vertices[name] = triangle_records[name][:, None]
-    materials = materials_of(triangle_records)
-    return {int(material): vertices[materials == material].reshape(-1) for material in np.unique(materials)}
+    return Scene(all_drawn, origin, contract.plane_z_m(box_map), loose, lamps)
