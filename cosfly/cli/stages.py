@@ -36,7 +36,7 @@ BACKEND = SettingOption("render.backend", "Renderer: gl, pyrender, carla or unre
 )
 def world(
     job: Job,
-    prompt: Annotated[str, Argument(help="The world, in plain English or Chinese.")],
+    prompt: Annotated[str, Argument(help="The world, in plain English.")],
     out: Annotated[Path | None, Option(show_default="worlds/<prompt>-<time>", help="New folder.")] = None,
     count: Annotated[
         int, Option(min=1, max=1000, help="Number of worlds, each with its own seed, pattern and sizes.")

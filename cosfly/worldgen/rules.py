@@ -1,7 +1,6 @@
-"""The embedded planner: reads an English or Chinese prompt by tables of words, without a model.
+"""The embedded planner: reads an English prompt by tables of words, without a model.
 
-What is read is taken out of the text, so that the rest are the words that were not used. Chinese is first turned into
-this English, word by word.
+What is read is taken out of the text, so that the rest are the words that were not used.
 
 Source: an alternative to the language model of app:simworld:step1 where no endpoint is given.
 """
@@ -56,8 +55,6 @@ _SIZES = {
     "length": rf"{_NUMBER} ?{_LENGTH} long\b",
 }
 _CHINESE = re.compile(r"[\u4e00-\u9fff]")
-_DIGITS = {character: value for value, character in enumerate("零一二三四五六七八九")} | {"两": 2}
-_UNITS = {"十": 10, "百": 100, "千": 1000}
 
 
 def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
@@ -76,10 +73,11 @@ class _Reader:
         self.plan: dict[str, Any] = WorldPlan().model_dump()
         self.not_used: list[str] = []
         self.not_respected: list[str] = []
-        self.chinese = dict[str, str]()  # the words of a Chinese prompt by their English
         text = prompt.lower().replace("’", "'")
         if _CHINESE.search(text):
-            text = self._in_english(text)
+            what, expected = "内置规则只读英文描述", "英文描述, 例如 'a small village with a church'"
+            fix = "用英文写这段描述, 或用 --planner URL 指定语言模型"
+            raise InputError(what, where="PROMPT", got=repr(prompt[:60]), expected=expected, fix=fix)
         for word in sorted(WORDS["numbers"], key=len, reverse=True):
             text = re.sub(rf"\b{word}\b", str(WORDS["numbers"][word]), text)
         for plain, pattern in (("1-stor", r"\bsingle[- ]stor"), ("hotel-buildings", r"(?<!\d )\bhotels\b")):
@@ -93,34 +91,6 @@ class _Reader:
     def _amount(match: re.Match[str]) -> str:
         word = "cars" if match[2] == "cars" else "trees"
         return f"{AMOUNTS[match[1]]}-{word}"
-
-    def _in_english(self, text: str) -> str:
-        """Return a Chinese text as English words in the order of the Chinese; unknown characters stay."""
-
-        def number(match: re.Match[str]) -> str:
-            total = digit = 0
-            for character in match[0]:
-                if character in _UNITS:
-                    total, digit = total + max(1, digit) * _UNITS[character], 0
-                digit = _DIGITS.get(character, digit)
-            return str(total + digit)
-
-        def word(match: re.Match[str]) -> str:
-            english = words.get(match[0], "")
-            self.chinese.setdefault(english.strip(), match[0])
-            return f" {english} "
-
-        measures = WORDS["chinese_measures"]
-        for many, about in (("几百|数百|上百", "200"), ("几十|数十", "30"), ("几|数", "4")):
-            text = re.sub(rf"(?:{many})(?=[{measures}])", about, text)
-        text = re.sub(rf"[零一二两三四五六七八九十百千]+(?=[{measures}米公顷平到至])", number, text)
-        for pattern, english in WORDS["chinese_rules"]:
-            text = re.sub(pattern.replace("N", _NUMBER), english, text)
-        text = re.sub(rf"(\d) *[{measures}]", r"\1 ", text)
-        words = {name: english for english, names in WORDS["chinese_words"].items() for name in names.split()}
-        words |= dict.fromkeys(WORDS["chinese_particles"].split(), "")
-        text = re.sub("|".join(sorted(words, key=len, reverse=True)), word, text)
-        return re.sub(r"\s+", " ", re.sub("[，。；、：！？（）]", " , ", text))
 
     # --- what is taken from the text ---
 
@@ -155,13 +125,13 @@ class _Reader:
         streets = self._take(r"\b(\d+) ([a-z-]+ )?(avenue|boulevard|spoke|street|road)s?\b", keep=r", \2 \3 ,")
         limits = {name: match for name, pattern in _LIMITS.items() if (match := self._take(pattern))}
         for second in [name for name in limits if name != "least"][1:]:
-            self.not_used.append(self._said(limits.pop(second)[0]))
+            self.not_used.append(limits.pop(second)[0].strip())
         without = ""
         while match := self._take(r"\b(?:no|without(?: any)?)\s+((?:(?! (?:but|and|with) )[^.,;:()])+)"):
             without += f"{match[1]} "
         objects = self._objects()
         lacking = [match[0] for word in _words(WORDS["lacking"]) if (match := self._take(rf"(?:\b\d+ )?\b{word}s?\b"))]
-        self.not_used += [self._said(phrase) for phrase in lacking]
+        self.not_used += [phrase.strip() for phrase in lacking]
         pattern = next((name for name, words in WORDS["patterns"].items() if self._has(words)), None)
         kind = next((name for name, entry in WORDS["settlements"].items() if self._has(entry["words"])), None)
         buildings = self._buildings()
@@ -209,22 +179,14 @@ class _Reader:
         return plan, trace
 
     def _refuse(self) -> None:
-        """Raise the error of a prompt of which nothing is read, in its language."""
+        """Raise the error of a prompt of which nothing is read."""
         what = "the rule-based planner recognises no word of this prompt"
-        expected = "an English or Chinese description, such as 'a small village with a church'"
+        expected = "an English description, such as 'a small village with a church'"
         fix = "name a kind of place, or use a language model with --planner URL"
-        if _CHINESE.search(self.prompt):
-            what, expected = "内置规则认不出这段描述中的任何词", "对城镇的描述, 例如 '有一座教堂的小村庄'"
-            fix = "写出地点的类型, 或用 --planner URL 指定语言模型"
         raise InputError(what, where="PROMPT", got=repr(self.prompt[:60]), expected=expected, fix=fix)
 
     def _has(self, words: str) -> bool:
         return any(re.search(rf"(?<![\w-]){re.escape(word)}s?(?![\w-])", self.text) for word in _words(words))
-
-    def _said(self, phrase: str) -> str:
-        """Return a phrase in the language of the prompt."""
-        phrase = phrase.strip()
-        return self.chinese.get(re.sub(r"^\d+ ", "", phrase), phrase)
 
     def _objects(self) -> dict[str, int]:
         """Take the objects of the table, the longest names first; return their counts."""
@@ -264,7 +226,7 @@ class _Reader:
                 if re.search(rf"(?<![\w-]){word}(?![\w-])", text)
             }  # fmt: skip
             if len(found) > 1:
-                got = " and ".join(repr(self._said(word)) for word in found.values())
+                got = " and ".join(repr(word) for word in found.values())
                 what = f"two words about {group} contradict each other"
                 raise InputError(what, where="PROMPT", got=got, fix="use only one of these words")
             if found:
@@ -390,8 +352,8 @@ class _Reader:
             for word in [*part.split(), "the"]:
                 if word in STOPS or word in ORDINARY or word.removesuffix("s") in ORDINARY:
                     if phrase and phrase != ["1"]:
-                        of = f" (of {self._said(word)})" if word not in STOPS and phrase[-1].isdigit() else ""
-                        phrases.append(self._said(" ".join(phrase)) + of)
+                        of = f" (of {word})" if word not in STOPS and phrase[-1].isdigit() else ""
+                        phrases.append(" ".join(phrase) + of)
                     phrase = []
                 elif word != "1" or phrase:
                     phrase.append(word)

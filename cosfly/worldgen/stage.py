@@ -49,7 +49,7 @@ WALK_M = 100.0  # the longest pedestrian trajectory that must fit: app:simworld:
 class WorldConfig(Config):
     """A world from text."""
 
-    prompt: str = Field("", description="description of the world, in plain English or Chinese")
+    prompt: str = Field("", description="description of the world, in plain English; a language model may take others")
     name: str = Field("TextWorld", min_length=1, max_length=60, description="name of the world's map")
     planner: str | None = Field(
         None, description="URL of the language model that plans the world; empty: built-in rules plan it"
