@@ -163,7 +163,6 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "world": ["world 'a small village with a well' --out {out}"],
     "simplify": ["simplify --map {maps} --out {out} {tiny}"],
     "pedestrians": ["pedestrians --map {simple} --out {out} {tiny}"],
-    "roi propose": ["roi propose {simple} --out {out}/roi_polygon.json {tiny}"],
     "plan": ["plan --map {simple} --paths {walks} --out {out} {tiny}"],
     "plan compare": ["plan compare {simple} {walks} --out {out} {tiny} --planner foresight --planner track_astar"],
     "plan benchmark": ["plan benchmark {simple} {walks} --out {out} {tiny} --planner theta_star --planner track_astar"],

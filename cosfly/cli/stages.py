@@ -102,15 +102,6 @@ def edit(
     server.serve()
 
 
-@command("cosfly roi propose simplify/step2_simplified.json --out roi_polygon.json", "pedestrians", "town")
-def propose(
-    job: Job, map_: options.MapArgument, out: Annotated[Path, Option(help="Region to write: roi_polygon.json.")]
-) -> None:
-    """Write the outline of the walkable ground as a first region, to edit with `cosfly roi edit`."""
-    typer.echo(job.call("cosfly.pedestrians.roi_editor:run_propose", map_, job.cfg.pedestrians, out))
-    typer.echo(out)
-
-
 @command("cosfly plan --map simplified.json --paths pedestrians/path.json --out plan", "plan", STAGE)
 def plan(job: Job, map_: options.Map, paths: Paths, out: options.Out) -> None:
     """Plan a drone trajectory for each pedestrian, drone_trace.json (step 4)."""

@@ -65,10 +65,6 @@ class OccupancyGrid:
 
 def empty_grid(box_map: BoxMap, resolution_m: float = RESOLUTION_M) -> OccupancyGrid:
     """Return a free grid over the bounds of all boxes of any kind."""
-    if len(box_map) == 0:
-        raise ValueError("the map has no boxes, so no grid can be made")
-    if not resolution_m > 0:
-        raise ValueError(f"resolution_m must be above 0 m, got {resolution_m}")
     low, high = box_map.bounds()
     num_x, num_y = (max(1.0, math.ceil((high[k] - low[k] - TOUCH_M) / resolution_m)) for k in (0, 1))
     if num_x * num_y > MAX_CELLS:
@@ -244,9 +240,6 @@ def _fill_hull(points, count, touch, mark, cells):  # pragma: no cover (compiled
 
 def compare(left: OccupancyGrid, right: OccupancyGrid) -> tuple[float, float]:
     """Return the share of equal cells of two grids of one frame, and the IoU of their occupied cells, 1 without any."""
-    same_frame = (left.x_min_m, left.y_min_m, left.resolution_m) == (right.x_min_m, right.y_min_m, right.resolution_m)
-    if not same_frame or left.occupied.shape != right.occupied.shape:
-        raise ValueError("the two grids do not cover the same cells; make the second one with like=<the first grid>")
     union = int(np.count_nonzero(left.occupied | right.occupied))
     intersection = int(np.count_nonzero(left.occupied & right.occupied))
     agreement = 1.0 - (union - intersection) / left.occupied.size
@@ -262,8 +255,6 @@ def inflate(grid: OccupancyGrid, radius_m: float) -> OccupancyGrid:
     A cell becomes occupied if its centre lies within `radius_m` of the centre of an occupied one: at 0.5 m cells, 0.5 m
     adds the four straight neighbours, and 1.0 m is the circular element of two cells of app:simworld:step4.
     """
-    if not radius_m >= 0:
-        raise ValueError(f"radius_m must be at least 0 m, got {radius_m}")
     radius = radius_m / grid.resolution_m + 1e-9
     reach = int(radius)
     if reach == 0:

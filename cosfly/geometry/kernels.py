@@ -62,13 +62,7 @@ def index_boxes(
         centers, half_extents: (k, 3) m. rotations: (k, 3, 3) world_from_box. cell_m: wanted cell size, grown if the map
             is vast.
     """
-    centers, half_extents = _points(centers, "centers"), _points(half_extents, "half_extents")
-    rotations = np.ascontiguousarray(rotations, dtype=np.float64)
-    if len(half_extents) != len(centers) or rotations.shape != (len(centers), 3, 3):
-        got = f"{centers.shape}, {half_extents.shape} and {rotations.shape}"
-        raise ValueError(f"centers, half_extents and rotations must have the same length, got the shapes {got}")
-    if not (np.isfinite(rotations).all() and (half_extents >= 0).all() and cell_m > 0):
-        raise ValueError("rotations must be finite, half_extents must be at least 0 m, and cell_m must be above 0 m")
+    centers, half_extents, rotations = _points(centers), _points(half_extents), _points(rotations)
     spans = np.einsum("kij,kj->ki", np.abs(rotations), half_extents)
     mins, maxs = centers - spans, centers + spans
     low, high = (mins[:, :2].min(axis=0), maxs[:, :2].max(axis=0)) if len(centers) else (np.zeros(2), np.zeros(2))
@@ -349,7 +343,7 @@ def signed_distances(index: BoxIndex, points: np.ndarray, reach_m: float = np.in
     Returns:
         (n,) m, at most reach_m, and (n,) the nearest box, -1 where there is none in reach (k == 0 too).
     """
-    return _signed_distances(index, _points(points, "points"), float(reach_m))
+    return _signed_distances(index, _points(points), float(reach_m))
 
 
 @njit(cache=True)
@@ -362,7 +356,7 @@ def _signed_distances(index, points, reach_m):
 
 def normals(index: BoxIndex, points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """Return the unit vectors away from boxes (k,) at points (k, 3), (k, 3), as `normal_of_box` does."""
-    return _normals(index, _points(points, "points"), np.ascontiguousarray(boxes, dtype=np.int64))
+    return _normals(index, _points(points), np.ascontiguousarray(boxes, dtype=np.int64))
 
 
 @njit(cache=True)
@@ -381,7 +375,7 @@ def segments_hit(index: BoxIndex, starts: np.ndarray, ends: np.ndarray, inflate_
     Returns:
         (n,) bool. Touching a face counts, lying inside too. k == 0 gives all False.
     """
-    return _segments_hit(index, *_pair(starts, ends), float(inflate_m))
+    return _segments_hit(index, _points(starts), _points(ends), float(inflate_m))
 
 
 @njit(cache=True)
@@ -403,7 +397,7 @@ def swept_distances(index: BoxIndex, points: np.ndarray, reach_m: float) -> tupl
         (n,) m, at most reach_m, negative only where an end of the segment is inside a box, 0 where it passes through
         one; (n,) the share of the segment where that is; (n,) the box, -1 where none is in reach.
     """
-    return _swept_distances(index, _points(points, "points"), float(reach_m))
+    return _swept_distances(index, _points(points), float(reach_m))
 
 
 @njit(cache=True)
@@ -439,7 +433,7 @@ def visibility(index: BoxIndex, drones: np.ndarray, targets: np.ndarray) -> np.n
     Returns:
         (n,) the fraction of unblocked rays, 0, 0.2 ... 1. k == 0 gives all 1.
     """
-    return _visibility(index, *_pair(drones, targets))
+    return _visibility(index, _points(drones), _points(targets))
 
 
 @njit(cache=True)
@@ -452,18 +446,8 @@ def _visibility(index, drones, targets):
     return fractions
 
 
-def _points(values: np.ndarray, name: str) -> np.ndarray:
-    array = np.ascontiguousarray(values, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
-        raise ValueError(f"{name} must be an array of finite numbers with shape (n, 3), got the shape {array.shape}")
-    return array
-
-
-def _pair(starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    starts, ends = _points(starts, "starts"), _points(ends, "ends")
-    if len(starts) != len(ends):
-        raise ValueError(f"starts and ends must have the same length, got {len(starts)} and {len(ends)}")
-    return starts, ends
+def _points(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values, dtype=np.float64)
 
 
 def distances_to_boxes_m(points_m: np.ndarray, other: Bystander) -> np.ndarray:

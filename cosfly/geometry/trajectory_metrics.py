@@ -24,9 +24,7 @@ def derivative_rms(positions_m: np.ndarray, order: int, dt_s: float = DT_S) -> f
 
     order: 1 speed (m/s), 2 acceleration (m/s^2), 3 jerk (m/s^3); it needs more than `order` points.
     """
-    differences = _differences(positions_m, order)
-    if dt_s <= 0:
-        raise ValueError(f"dt_s must be above 0 s, got {dt_s}")
+    differences = np.diff(positions_m, n=order, axis=0)
     return float(np.sqrt((differences**2).sum(axis=1).mean())) / dt_s**order if len(differences) else 0.0
 
 
@@ -37,7 +35,7 @@ def smoothness_score(accel_rms_mps2: float, jerk_rms_mps3: float) -> float:
 
 def length_m(positions_m: np.ndarray) -> float:
     """Return the length of the polyline through (n, 3) points."""
-    return float(np.linalg.norm(_differences(positions_m, 1), axis=1).sum())
+    return float(np.linalg.norm(np.diff(positions_m, axis=0), axis=1).sum())
 
 
 def distances_along_m(points_m: np.ndarray) -> np.ndarray:
@@ -47,7 +45,7 @@ def distances_along_m(points_m: np.ndarray) -> np.ndarray:
 
 def speed_max_mps(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
     """Return the largest speed between neighbouring waypoints, (n, 3) m, in m/s; 0 for one point."""
-    return float(np.linalg.norm(_differences(positions_m, 1), axis=1).max(initial=0.0)) / dt_s
+    return float(np.linalg.norm(np.diff(positions_m, axis=0), axis=1).max(initial=0.0)) / dt_s
 
 
 def trajectory_metrics(
@@ -86,13 +84,6 @@ def trajectory_metrics(
         "clearance_min_m": float(clearances_m.min()),
     }
     return {name: round(value, 4) for name, value in figures.items()}
-
-
-def _differences(positions_m: np.ndarray, order: int) -> np.ndarray:
-    positions = np.asarray(positions_m, dtype=np.float64)
-    if positions.ndim != 2 or positions.shape[1] != 3:
-        raise ValueError(f"positions must have the shape (n, 3), got the shape {positions.shape}")
-    return np.diff(positions, n=order, axis=0)
 
 
 # --- intervals --------------------------------------------------------------------------------------------------------

@@ -107,9 +107,6 @@ def cover(
     the side and at the share) that leaves the least empty area. Both sizes grow with a very large polygon, so that a
     few corners cannot ask for a million pieces.
     """
-    if not 0 < min_fill <= 1 or not min_size_m > 0 or not all(0 < share < 1 for share in shares):
-        got = f"got min_fill {min_fill}, min_size_m {min_size_m}, shares {shares}"
-        raise ValueError(f"min_fill and shares must be between 0 and 1, and min_size_m must be above 0 m; {got}")
     min_size_m, max_size_m = _sizes_for(polygon, min_size_m, max_size_m, shares)
     done: list[Rectangle] = []
     waiting = [(piece, 0) for piece in polygons_of(polygon)]

@@ -1,7 +1,7 @@
 """The cheapest route over a grid of free cells: exact A* with octile costs and no corner cutting.
 
 A straight step costs 1, a diagonal one sqrt 2, and a diagonal step needs both straight neighbours free (sec:step3).
-With several classes of cells, a step costs this times the mean cost of its two cells along its axis. Path costs are
+With several classes of cells, a step costs this times the mean cost of its two cells. Path costs are
 kept as two integers, the weighted straight and diagonal steps, so that equal costs compare as equal in any order of
 steps: the result is the true optimum, not the optimum up to rounding, and ties break the same way everywhere.
 """
@@ -20,7 +20,7 @@ SQRT2 = math.sqrt(2.0)
 _STEP_X = np.array([1, 0, -1, 0, 1, -1, -1, 1], dtype=np.int64)
 _STEP_Y = np.array([0, 1, 0, -1, 1, 1, -1, -1], dtype=np.int64)
 
-UNIFORM = np.ones((1, 4), dtype=np.int64)
+UNIFORM = np.ones(1, dtype=np.int64)
 
 _UNSEEN, _OPEN, _CLOSED = 0, 1, 2
 TOTAL, TO_GO, CELL = range(3)  # columns of the heap
@@ -35,17 +35,9 @@ def find_route(
 
     Args:
         free: (ny, nx) bool, contiguous; start, goal: (x index, y index).
-        classes: (ny, nx) uint8, rows of `costs`; None: all 0. costs: (classes, 4) int64, at least 1, the cost of a
-            cell along x, along y, and along the diagonals of equal and of opposite signs.
+        classes: (ny, nx) uint8, places in `costs`; None: all 0. costs: (classes,) int64, at least 1, of a cell.
     """
-    if free.ndim != 2 or free.dtype != np.bool_ or not free.flags.c_contiguous:
-        raise ValueError("free must be a contiguous two-dimensional array of bool")
-    num_y, num_x = free.shape
-    for name, (x, y) in (("start", start), ("goal", goal)):
-        if not (0 <= x < num_x and 0 <= y < num_y):
-            raise ValueError(f"the {name} {(int(x), int(y))} is outside the grid of {num_x} x {num_y} cells")
-        if not free[y, x]:
-            raise ValueError(f"the {name} {(int(x), int(y))} is not a free cell")
+    num_x = free.shape[1]
     # Zeroed pages are allocated on access, so a search pays for the cells it visits and not for the grid.
     state = np.zeros(free.size, dtype=np.uint8)
     steps = np.empty((free.size, 2), dtype=np.int32)
@@ -105,8 +97,7 @@ def _search(free, origin, target, state, steps, from_direction, classes, costs, 
             neighbour = next_y * num_x + next_x
             if state[neighbour] == _CLOSED:
                 continue
-            axis = direction % 2 + direction // 4 * 2
-            cost = costs[classes[y, x], axis] + costs[classes[next_y, next_x], axis]
+            cost = costs[classes[y, x]] + costs[classes[next_y, next_x]]
             straight = steps[cell, STRAIGHT] + (cost if direction < 4 else 0)
             diagonal = steps[cell, DIAGONAL] + (cost if direction >= 4 else 0)
             if state[neighbour] == _OPEN:

@@ -8,7 +8,7 @@ const MOST_STEPS = 300, MOST_DOTS = 4000, NEAR_PX = 9;
 const LABELS = {
   en: {
     title: "region of interest", fit: "Whole map", backdrop: "backdrop", grid: "planning grid", above: "map from above", picture: "picture", outer: "New polygon", hole: "New hole",
-    close: "Close polygon", undo: "Undo", redo: "Redo", remove: "Remove vertex", discard: "Remove polygon", vertex: "vertex", propose: "Propose", open: "Open file", save: "Save",
+    close: "Close polygon", undo: "Undo", redo: "Redo", remove: "Remove vertex", discard: "Remove polygon", vertex: "vertex", open: "Open file", save: "Save",
     mask: "Compare mask", south: "first row is south", polygon: "polygon", holeOf: "hole", open_ring: "open", points: "points",
     keys: "Click: vertex. Drag: move. Double click on an edge: new vertex. Wheel: zoom; right drag: pan. Keys: arrows move the vertex by a cell (Shift: ten) or pan; N, B next and previous vertex; " +
       "Space: vertex at the cross; + - zoom; Esc: clear the selection.",
@@ -20,7 +20,7 @@ const LABELS = {
   },
   zh: {
     title: "感兴趣区域", fit: "全图", backdrop: "底图", grid: "规划栅格", above: "俯视图", picture: "图片", outer: "新多边形", hole: "新孔洞",
-    close: "闭合多边形", undo: "撤销", redo: "重做", remove: "删除顶点", discard: "删除多边形", vertex: "顶点", propose: "自动建议", open: "打开文件", save: "保存",
+    close: "闭合多边形", undo: "撤销", redo: "重做", remove: "删除顶点", discard: "删除多边形", vertex: "顶点", open: "打开文件", save: "保存",
     mask: "对比掩膜", south: "首行为南", polygon: "多边形", holeOf: "孔洞", open_ring: "未闭合", points: "个点",
     keys: "单击：加顶点；拖动：移动；双击边：插入顶点；滚轮：缩放；右键拖动：平移。按键：方向键移动顶点一格（Shift：十格）或平移；N、B 下一个/上一个顶点；空格：在十字处加顶点；+ - 缩放；Esc：取消选择。",
     occupied: "占用", margin: "安全边距", unused: "空闲但不用", free: "空闲", in_region: "区域内", walkable: "可行走", outside: "地图之外", cell: "栅格",
@@ -172,7 +172,6 @@ const save = () => attempt(async () => {
   const answer = await (await request("save", JSON.stringify(roi))).json();
   tell("saved", answer.saved);
 });
-const proposeFirst = () => attempt(async () => put((await (await request("propose")).json()).roi));
 
 // --- a mask to compare ------------------------------------------------------------------------------------------------
 
@@ -355,7 +354,7 @@ document.addEventListener("keydown", (event) => {
   work(event.shiftKey);
 });
 const BUTTONS = {
-  fit: () => map.fit(), outer: () => begin("outer"), hole: () => begin("hole"), close, undo: () => stepTo(steps.at - 1), redo: () => stepTo(steps.at + 1), remove: removeVertex, discard, propose: proposeFirst, save,
+  fit: () => map.fit(), outer: () => begin("outer"), hole: () => begin("hole"), close, undo: () => stepTo(steps.at - 1), redo: () => stepTo(steps.at + 1), remove: removeVertex, discard, save,
   language: () => { state.language = state.language === "en" ? "zh" : "en"; tell(...state.said); compare(); update(); },
 };
 for (const [id, work] of Object.entries(BUTTONS)) byId(id).addEventListener("click", () => { work(); board.focus(); });

@@ -1,4 +1,4 @@
-"""`cosfly roi`: the region of interest of a map, proposed, and drawn on a local page (subsec:appendix_g_editor).
+"""`cosfly roi`: the region of interest of a map, drawn on a local page (subsec:appendix_g_editor).
 
 The page only draws: this module computes the walkable ground of a region with the code of the pedestrian stage.
 """
@@ -15,13 +15,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-import shapely
-from shapely.geometry.base import BaseGeometry
 
 from cosfly.formats.boxes import AXES, BoxMap, check_ground, read_boxes
-from cosfly.formats.roi import Backdrop, Roi, RoiPolygon, parse_roi, write_roi
+from cosfly.formats.roi import Backdrop, Roi, parse_roi, write_roi
 from cosfly.geometry.grid import empty_grid
-from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, check_roi, walkable_ground
+from cosfly.pedestrians.walkable import PedestriansConfig, check_roi, walkable_ground
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import read_bytes, read_text, sha256_bytes
 from cosfly.viz.page import page, scripts
@@ -31,57 +29,7 @@ from cosfly.viz.topview import TopView, draw_map, png_bytes
 MOST_SIDE, MOST_CELLS = 16_000, 64_000_000  # what browsers draw on one canvas
 OCCUPIED, MARGIN, UNUSED, FREE = 128, 190, 228, 255  # grey levels of the backdrop
 IN_REGION, WALKABLE = (90, 160, 230, 60), (60, 150, 240, 110)  # RGBA over the backdrop
-TOLERANCE_M, SMALLEST_HOLE_M2 = 1.0, 100.0  # of a proposed region, which a person edits
 FROM_ABOVE_PX = 2400
-
-
-def propose(ground: WalkableGround, name: str) -> Roi:
-    """Return the outline of the ground that pedestrians use, without holes below SMALLEST_HOLE_M2, to TOLERANCE_M."""
-    grid = ground.grid
-    half_m = 0.5 * grid.resolution_m  # outlines run through the middles of cells
-    outlines, tree = cv2.findContours(ground.walkable.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-    shapes: dict[bool, list[BaseGeometry]] = {False: [], True: []}
-    for outline, parent in zip(outlines, tree[0, :, 3], strict=True):
-        ring = grid.centers_of(outline[:, 0])
-        shape = shapely.Polygon(ring) if len(ring) > 2 else shapely.MultiPoint(ring).convex_hull
-        shapes[bool(parent >= 0)].append(shapely.make_valid(shape))
-    outer, holes = (
-        shapely.buffer(shapely.union_all(shapes[is_hole]), -half_m if is_hole else half_m, join_style="mitre")
-        for is_hole in (False, True)
-    )
-    region = shapely.simplify(outer - holes, TOLERANCE_M)
-    parts = shapely.get_parts(shapely.set_precision(region, 0.001))
-    first, *others = (
-        RoiPolygon(points_world=_ring(part.exterior), holes=[_ring(hole) for hole in part.interiors if _is_large(hole)])
-        for part in sorted(parts, key=lambda part: -part.area)
-        if _is_large(part.exterior) or part is parts[0]
-    )
-    return Roi(**first.model_dump(), polygons=others, description="outline of the walkable ground", map=name, axes=AXES)
-
-
-def _ring(ring: shapely.LinearRing) -> list[tuple[float, float]]:
-    return [(round(x, 3), round(y, 3)) for x, y in ring.coords[:-1]]
-
-
-def _is_large(ring: shapely.LinearRing) -> bool:
-    return shapely.Polygon(ring).area >= SMALLEST_HOLE_M2
-
-
-def run_propose(map_: Path, cfg: PedestriansConfig, out: Path) -> str:
-    """Read a map, write a first `roi_polygon.json` and return a report of its content."""
-    if out.is_dir():
-        raise InputError("the output path is a folder", where=out, fix="pass the path of a file as --out")
-    if out.exists():
-        raise InputError(
-            "the output file already exists", where=out, fix="choose another --out, or remove the existing file"
-        )
-    box_map = _read_map(map_)
-    roi = propose(walkable_ground(box_map, cfg, where=map_), box_map.name)
-    ground = walkable_ground(box_map, cfg, roi, where=map_, roi_where=out)
-    write_roi(out, roi)
-    polygons = roi.rings()
-    num_holes = sum(len(polygon.holes) for polygon in polygons)
-    return f"polygons: {len(polygons)}, holes: {num_holes}, walkable cells: {ground.counts['cells_used']:,}"
 
 
 def _read_map(path: Path) -> BoxMap:
@@ -192,7 +140,6 @@ class Editor:
         answers: dict[str, Callable[[], dict[str, Any]]] = {
             "cells": lambda: self.cells(parse_roi(data, Path("the page")) if data else None),
             "open": lambda: self.region_of(data, Path("the file")),
-            "propose": lambda: {"roi": propose(self.bare, self.box_map.name).model_dump()},
             "save": lambda: self.save(data),
         }
         if name not in answers:

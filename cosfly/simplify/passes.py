@@ -80,10 +80,6 @@ def merge(
 def clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:
     """Return the lowest row of each box's cluster, (n,) int64: boxes, (n, 3) m, with gaps of at most `gap_m` on every
     axis."""
-    if mins.shape != maxs.shape or mins.ndim != 2 or mins.shape[1] != 3:
-        raise ValueError(f"mins and maxs must both have the shape (n, 3), got the shapes {mins.shape} and {maxs.shape}")
-    if not gap_m >= 0:
-        raise ValueError(f"gap_m must be at least 0 m, got {gap_m}")
     # Imported here, because every command reads the settings of this module.
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
