@@ -248,10 +248,9 @@ FRAME = (  # everything of a frame but pictures and depth
     ),
     Column("target_offset", POINT, lambda f, i: f.perturbation.target_m[i]),
     Column("action", ACTION, lambda f, i: f.motion.action[i]),
-    Column("actions", "numbers", lambda f, i: f.motion.actions[i]),
+    Column("actions", "numbers", lambda f, i: f.motion.action[i]),
     Column("waypoints", "numbers", lambda f, i: f.motion.waypoints(i)),
     Column("body_waypoints", "numbers", lambda f, i: f.motion.body_waypoints(i)),
-    Column("poses_between", "numbers", lambda f, i: f.motion.between[i]),
     Column("has_caption", "bool", of_caption=lambda c: True, required=True),
 )  # fmt: skip
 CAPTION = (  # what a row holds of an accepted caption, and nulls where there is none
@@ -305,7 +304,6 @@ POINT_NAMES = (
     "intrinsics", "pose", "target", "target_heading_deg", "target_uv", "target_bbox", "target_mask_bbox",
     "target_depth_m", "target_in_view", "target_visible", "visibility", "target_height_px", "target_contrast",
     "target_legible", *COMPANY_COLUMNS, "is_perturbed", "perturbation", "drone_offset", "target_offset",
-    "poses_between",
 )  # fmt: skip
 POINTS = tuple(column for column in FRAME if column.name in POINT_NAMES)
 SCALAR_NAMES = [column.name for column in SCALARS]
@@ -317,16 +315,6 @@ REQUIRED = frozenset(column.name for column in FRAME if column.required)
 def caption_values(caption: Caption) -> ReleasedCaption:
     """Return what a row holds of a caption."""
     return {column.name: column.of_caption(caption) for column in SCALARS if column.of_caption is not None}
-
-
-def between_of(rows: Collection[Mapping[str, Any]]) -> np.ndarray | None:
-    """Return `Track.between` of the rows of a track; None where it was planned at the rate of its frames."""
-    found = [row.get("poses_between") for row in rows]
-    most = max((len(one) // len(POSE) for one in found if one), default=0)
-    nothing = np.full(most * len(POSE), np.nan)
-    is_whole = [one is not None and len(one) == len(nothing) for one in found]
-    flat = [one if whole else nothing for one, whole in zip(found, is_whole, strict=True)]
-    return np.array(flat, dtype=np.float64).reshape(len(found), most, len(POSE)) if most else None
 
 
 def matrices_of(intrinsics: np.ndarray) -> np.ndarray:

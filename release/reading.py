@@ -41,7 +41,6 @@ from release.columns import (
     REQUIRED,
     SCALAR_NAMES,
     VALUES,
-    between_of,
     matrices_of,
     track_name,
 )
@@ -189,7 +188,7 @@ class TrackRows:
             perturbation=Perturbation(
                 self.flags("is_perturbed"), self.drone_offset[:, :3], self.drone_offset[:, 3:], self.target_offset
             ),
-            intrinsics=matrices if self.zooms else None, between=between_of(self.rows),
+            intrinsics=matrices if self.zooms else None,
             people=self.people, goal=self.goal, bystanders=None if None in self.column("others_in_view")
             else np.stack([self.numbers(name) for name in COMPANY_COLUMNS], axis=1),
         )  # fmt: skip

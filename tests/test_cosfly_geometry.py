@@ -102,31 +102,14 @@ def building_at(depth_m: float) -> View:
     return View(np.full((90, 160), depth_m, np.float32), instance, np.eye(3), np.zeros(3))
 
 
-@each(("before_m", "after_m", "is_found"), [(20.0, 23.0, True), (23.0, 20.0, False), (20.0, 20.0, False)])
-def test_a_thing_that_is_farther_has_moved_and_one_that_is_nearer_may_hide_itself(before_m, after_m, is_found):
-    """From behind a corner another wall of the same building stands before the one that was seen."""
-    assert (compare_views(building_at(before_m), building_at(after_m), CAMERA).moved > 0) == is_found
-
-
-@each(("kind", "num_renamed", "is_found"), [("Buildings", 40, True), ("Buildings", 2, False), ("Roads", 40, False)])
-def test_a_thing_under_another_id_is_told_but_for_ground(kind, num_renamed, is_found):
-    """A wall at one place, of which in the second picture so many columns have another id."""
-    views = [building_at(20.0), building_at(20.0)]
-    for view in views:
-        view.instance[..., 0] = KINDS[kind]
-    views[0].instance[:, :40, 1] = 8
-    views[1].instance[:, :num_renamed, 1] = 9
-    views[1].instance[:, num_renamed:40, 1] = 8
-    assert (compare_views(*views, CAMERA).other_id > 0) == is_found
-
-
 def test_what_another_thing_hides_is_not_gone_and_what_comes_nearer_by_itself_is():
     """From behind a corner a wall stands before what was seen; seen from the first place it lies outside or is hidden.
     A wall that comes nearer without a camera that moves is before what the first picture shows."""
     corner, street = building_at(6.0), building_at(20.0)
     corner = View(corner.depth, corner.instance, np.eye(3), np.array([30.0, 0.0, 0.0]))
     around = compare_views(View(street.depth, street.instance, np.eye(3), np.zeros(3)), corner, CAMERA)
-    assert around.hidden == around.seen > 500
+    assert around.seen > 500
+    assert around.agree == 0
     assert around.missing_share == 0.0
     assert compare_views(street, building_at(6.0), CAMERA).missing_share == 1.0
     assert compare_views(building_at(6.0), street, CAMERA).missing_share == 1.0
@@ -341,12 +324,9 @@ def curve(num: int, dt_s: float = 0.1) -> DroneTrace:
     )  # fmt: skip
 
 
-def motion_of(time_s, poses, between=None) -> PlannedMotion:
+def motion_of(time_s, poses) -> PlannedMotion:
     poses = np.asarray(poses, dtype=np.float64)
-    return PlannedMotion(
-        np.asarray(time_s), poses, np.empty((len(poses), 0, 6)) if between is None else between, poses[:, 4],
-        poses[:, :3],
-    )  # fmt: skip
+    return PlannedMotion(np.asarray(time_s), poses, poses[:, 4], poses[:, :3])
 
 
 def test_the_known_answer_of_the_public_release_as_an_action():
@@ -358,18 +338,15 @@ def test_the_known_answer_of_the_public_release_as_an_action():
 
 
 def test_flying_the_actions_gives_the_plan():
-    trace = curve(31)
-    shown, between = trace.every(5), trace.between(5)
-    motion = motion_of(shown.time_s, np.hstack([shown.positions_m, shown.rotations_deg]), between)
+    shown = curve(31).every(5)
+    motion = motion_of(shown.time_s, np.hstack([shown.positions_m, shown.rotations_deg]))
     yaw = np.radians(np.stack([np.zeros(7), motion.yaw_deg, np.zeros(7)], axis=1))
-    for part in range(1, 6):
-        flown = (motion.actions[:-1, :part, :3] * 0.1).sum(axis=1)
-        reached = motion.poses[:-1, :3] + np.einsum("nij,nj->ni", rotation_matrices(yaw)[:-1], flown)
-        assert_allclose(reached, trace.positions_m[part::5][:6], atol=1e-9)
-        turned = shown.rotations_deg[:-1, 1] + (motion.actions[:-1, :part, 3] * 0.1).sum(axis=1)
-        assert_allclose(np.cos(np.radians(turned - trace.rotations_deg[part::5][:6, 1])), 1.0)
-        assert_allclose(motion.actions[:-1, part - 1, 4], trace.rotations_deg[part::5][:6, 0])
-    assert_allclose(motion.action[:-1, :4], motion.actions[:-1, :, :4].mean(axis=1))
+    flown = motion.action[:-1, :3] * 0.5
+    reached = motion.poses[:-1, :3] + np.einsum("nij,nj->ni", rotation_matrices(yaw)[:-1], flown)
+    assert_allclose(reached, shown.positions_m[1:], atol=1e-9)
+    turned = shown.rotations_deg[:-1, 1] + motion.action[:-1, 3] * 0.5
+    assert_allclose(np.cos(np.radians(turned - shown.rotations_deg[1:, 1])), 1.0)
+    assert_allclose(motion.action[:-1, 4], shown.rotations_deg[1:, 0])
 
 
 STEP_S = 0.5

@@ -89,8 +89,7 @@ class OpenEpisode:
         self.controller = Controller(controls, simulation.drone, lead[-1])
         self.moments = deque(lead, num_frames)
         poses = np.hstack([plan.positions_m, plan.rotations_deg])
-        no_poses_between = np.empty((len(poses), 0, 6))
-        motion = PlannedMotion(plan.time_s, poses, no_poses_between, plan.rotations_deg[:, 1], plan.positions_m)
+        motion = PlannedMotion(plan.time_s, poses, plan.rotations_deg[:, 1], plan.positions_m)
         for moment, command in zip(lead[:-1], motion.action, strict=False):
             self.note(moment, EngineDecision("lead"), command, float(plan.clearances_m[moment.index]))
 

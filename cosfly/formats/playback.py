@@ -103,9 +103,8 @@ class Track:
     targets_m: (n, 3) hip of the target, NaN if the file has none. segments, mission: As planned.
 
     Optional fields, None if the file has none. intrinsics: (n, 3, 3) of a camera that zooms; otherwise `camera` is that
-    of all frames (`camera_at` covers both). between: (n, k - 1, 6) planned poses after each frame, of a trajectory
-    planned at k times the frame rate; NaN after the last frame. people: Their appearance. goal: The description of the
-    target. bystanders: (n, 5), frames.BYSTANDER_COLUMNS.
+    of all frames (`camera_at` covers both). people: Their appearance. goal: The description of the target. bystanders:
+    (n, 5), frames.BYSTANDER_COLUMNS.
     """
 
     town: str
@@ -127,7 +126,6 @@ class Track:
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
     intrinsics: np.ndarray | None = None
-    between: np.ndarray | None = None
     people: People | None = None
     goal: Goal | None = None
     bystanders: np.ndarray | None = None
@@ -196,8 +194,7 @@ class Track:
     @cached_property
     def motion(self) -> PlannedMotion:
         """The planned motion that a policy learns."""
-        between = np.empty((len(self), 0, 6)) if self.between is None else self.between
-        return PlannedMotion(self.time_s, self.planned[0], between, self.rotations_deg[:, 1], self.positions_m)
+        return PlannedMotion(self.time_s, self.planned[0], self.rotations_deg[:, 1], self.positions_m)
 
     @property
     def pace(self) -> str:
@@ -340,7 +337,6 @@ def read_track(folder: Path, *, strict: bool = True) -> Track:
         segments=segments,
         mission=mirrored(mission),
         intrinsics=reader.intrinsics(points, camera),
-        between=reader.between(points),
         people=people,
         goal=goal,
         bystanders=None if np.isnan(bystanders[:, 0]).any() else bystanders,
@@ -437,20 +433,6 @@ class _FieldReader:
                 self.issue(f"points[{i}].nav_waypoint.t1_world", shown(waypoint), expected)
                 break  # one issue per file
         return poses
-
-    def between(self, points: list[dict]) -> np.ndarray | None:
-        """Read the planned poses between points, (n, k - 1, 6), NaN after the last point; None if there are none."""
-        if len(points) < 2 or not any(point.get("between") for point in points):
-            return None
-        poses = numbers([point.get("between") for point in points[:-1]], None, None, len(POSE))
-        if poses is None:
-            self.issue(
-                "points[].between",
-                "lists of another shape",
-                "as many poses at each point, of 6 finite numbers each",
-            )
-            return None
-        return np.concatenate([mirror_poses(poses), np.full((1, *poses.shape[1:]), np.nan)])
 
     def camera(self, group: Any) -> Camera:
         if not isinstance(group, dict):
@@ -594,8 +576,6 @@ def write_track(folder: Path, track: Track, *, with_flags: bool = False) -> None
             "perturbation": object_of(point, "perturbation"),
             "action": _tree_action(track.motion.action[i]),
         }
-        if track.between is not None:
-            point["between"] = None if is_last else (mirror_poses(track.between[i]) + 0.0).tolist()
         if track.intrinsics is not None:
             point["camera"] = {**object_of(point, "camera"), **track.camera_at(i).focal_record()}
         has_no_target = "target" in point and point["target"] is None and np.isnan(track.targets_m[i]).all()

@@ -128,14 +128,6 @@ class DroneTrace:
             mission=mission,
         )
 
-    def between(self, stride: int) -> np.ndarray | None:
-        """Return the poses that `every` skips, (n, stride - 1, 6), NaN after the last point; None if stride is 1."""
-        if stride == 1:
-            return None
-        points = np.arange(0, len(self.time_s), stride)
-        poses = np.hstack([self.positions_m, self.rotations_deg])[points[:-1, None] + np.arange(1, stride)]
-        return np.concatenate([poses, np.full((1, stride - 1, 6), np.nan)])
-
     def as_json(self) -> dict:
         return {
             "id": self.path_id,

@@ -44,44 +44,30 @@ def without_perturbation(
 
 @dataclass(frozen=True)
 class PlannedMotion:
-    """The planned motion of a track, n frames of k poses each.
+    """The planned motion of a track, n frames.
 
-    time_s: (n,). poses: (n, 6) planned poses at the frames; NaN where unknown. between: (n, k - 1, 6) planned poses
-    after each frame and before the next, at even times; NaN after the last frame. yaw_deg, positions_m: (n,), (n, 3) of
+    time_s: (n,). poses: (n, 6) planned poses at the frames; NaN where unknown. yaw_deg, positions_m: (n,), (n, 3) of
     the frames as rendered, with perturbations; actions and waypoints are relative to these.
     """
 
     time_s: np.ndarray
     poses: np.ndarray
-    between: np.ndarray
     yaw_deg: np.ndarray
     positions_m: np.ndarray
 
-    @property
-    def poses_a_frame(self) -> int:
-        return self.between.shape[1] + 1
-
-    @cached_property
-    def actions(self) -> np.ndarray:
-        """Return the actions for the k parts of the step from each frame to the next, (n, k, 5) as ACTION.
-
-        They are mean velocities in the axes of the frame, and the camera's pitch at the part's end; NaN after the last
-        frame.
-        """
-        n, k = len(self.poses), self.poses_a_frame
-        actions = np.full((n, k, len(ACTION)), np.nan)
-        chain = np.concatenate([self.poses[:-1, None], self.between[:-1], self.poses[1:, None]], axis=1)
-        part_s = np.diff(self.time_s)[:, None] / k
-        steps = np.diff(chain, axis=1) / part_s[..., None]
-        actions[:-1, :, :3] = in_axes_of(self.yaw_deg[:-1, None], steps[..., :3])
-        actions[:-1, :, 3] = wrap_deg(np.diff(chain[..., 4], axis=1)) / part_s
-        actions[:-1, :, 4] = chain[:, 1:, 3]
-        return actions
-
     @cached_property
     def action(self) -> np.ndarray:
-        """Return the action for the whole step from each frame to the next, (n, 5) as ACTION."""
-        return np.concatenate([self.actions[..., :4].mean(axis=1), self.actions[:, -1, 4:]], axis=1)
+        """Return the action for the step from each frame to the next, (n, 5) as ACTION.
+
+        It is the mean velocities in the axes of the frame, and the camera's pitch at the end; NaN after the last frame.
+        """
+        action = np.full((len(self.poses), len(ACTION)), np.nan)
+        step_s = np.diff(self.time_s)
+        steps = np.diff(self.poses, axis=0) / step_s[:, None]
+        action[:-1, :3] = in_axes_of(self.yaw_deg[:-1], steps[:, :3])
+        action[:-1, 3] = wrap_deg(np.diff(self.poses[:, 4])) / step_s
+        action[:-1, 4] = self.poses[1:, 3]
+        return action
 
     def waypoints(self, i: int) -> np.ndarray:
         """Return the planned positions at the next NUM_WAYPOINTS frames, fewer at the end, (m, 4) as WAYPOINT."""

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosfly.formats.frames import SHARED_ID
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
 from cosfly.runtime.compiled import njit
 
@@ -18,9 +17,7 @@ COLUMNS, GRID_ROWS = 64, 36  # the points are the middles of this grid's cells
 NEAR_M, FAR_M = 0.3, 999.0  # range of depths; the sky is farther
 LEAST_SEEN = 150  # points; a share of fewer is not reported
 LEAST_PLANES = 30  # points; the depth error of fewer is not reported
-LEAST_OF_OBJECT = 12  # points of an object; fewer are not reported
-SEEN, AGREE, HIDDEN, MISSING, SAME = range(5)  # indices of the counts of `_reproject`; names as in `Agreement`
-FIRM, MOVED, OTHER_ID = 1, 2, 3  # states of a point, see `_reproject`
+SEEN, AGREE, MISSING, SAME = range(4)  # indices of the counts of `_reproject`; names as in `Agreement`
 # Kinds of objects that may be elsewhere in the next frame, (256,) bool by kind.
 MOVING = np.isin(np.arange(256), [KINDS[kind] for kind in (
     "Pedestrians", "Rider", "Car", "Truck", "Bus", "Train", "Motorcycle", "Bicycle", "Dynamic",
@@ -50,13 +47,10 @@ class Agreement:
 
     seen: int  # within the other picture; of these:
     agree: int  # at the same depth
-    hidden: int  # behind a nearer surface
     same: int  # of `agree`: with the same instance, or on flat ground with the same kind
     error: float  # median depth error of those of `agree` on planes, where it is exact, as a share; NaN: too few
     error_flat: float  # of those on flat ground
     error_off_flat: float  # of all others
-    moved: int  # of one instance, most of which is farther away in the other frame; 0: there is none
-    other_id: int  # of one instance, most of which has the same depth but another id in the other frame; 0: none
     # Larger share of points of one frame that are in front of all surfaces of the other, so that their own surface is
     # missing there. In a static world it is 0: a point that is not visible is hidden by something nearer.
     missing_share: float
@@ -71,7 +65,7 @@ def compare_views(a: View, b: View, intrinsics_a: np.ndarray, intrinsics_b: np.n
     k_b = k_a if intrinsics_b is None else intrinsics_b.astype(np.float64)
     turn = b.rotation.T @ a.rotation  # b_from_a
     shift = b.rotation.T @ (a.position_m - b.position_m)
-    counts, errors, is_off_flat, ids, states = _reproject(
+    counts, errors, is_off_flat = _reproject(
         a.depth, a.instance, b.depth, b.instance, k_a, k_b, turn, shift, MOVING, FLAT
     )
     counts_back, *_ = _reproject(
@@ -79,10 +73,9 @@ def compare_views(a: View, b: View, intrinsics_a: np.ndarray, intrinsics_b: np.n
     )
     missing_shares = [c[MISSING] / c[SEEN] for c in (counts, counts_back) if c[SEEN] >= LEAST_SEEN]
     return Agreement(
-        seen=int(counts[SEEN]), agree=int(counts[AGREE]), hidden=int(counts[HIDDEN]), same=int(counts[SAME]),
-        error=_error_of(errors), error_flat=_error_of(errors[~is_off_flat]),
-        error_off_flat=_error_of(errors[is_off_flat]), moved=_most_of_one(ids, states, MOVED),
-        other_id=_most_of_one(ids, states, OTHER_ID), missing_share=float(max(missing_shares, default=0.0)),
+        seen=int(counts[SEEN]), agree=int(counts[AGREE]), same=int(counts[SAME]), error=_error_of(errors),
+        error_flat=_error_of(errors[~is_off_flat]), error_off_flat=_error_of(errors[is_off_flat]),
+        missing_share=float(max(missing_shares, default=0.0)),
     )  # fmt: skip
 
 
@@ -97,19 +90,6 @@ def median_of(values: np.ndarray) -> float:
     return float(ordered[middle] if len(values) % 2 else (ordered[middle - 1] + ordered[middle]) / 2.0)
 
 
-def _most_of_one(ids: np.ndarray, states: np.ndarray, state: int) -> int:
-    """Return the largest number of points of one instance in a state, of instances with fewer FIRM points."""
-    ids_in_state = ids[states == state]
-    if len(ids_in_state) < LEAST_OF_OBJECT:
-        return 0
-    counts = np.bincount(ids_in_state, minlength=SHARED_ID + 1)
-    num_firm = np.bincount(ids[states == FIRM], minlength=len(counts))
-    counts[counts <= num_firm[: len(counts)]] = 0  # an id over SHARED_ID makes `num_firm` longer
-    counts[[0, SHARED_ID]] = 0  # the ids of no instance and of several instances
-    most = int(counts.max())
-    return most if most >= LEAST_OF_OBJECT else 0
-
-
 @njit(cache=True, nogil=True)
 def _reproject(  # type: ignore[no-untyped-def]
     depth_a, inst_a, depth_b, inst_b, intrinsics_a, intrinsics_b, turn, shift, moving, flat
@@ -120,18 +100,15 @@ def _reproject(  # type: ignore[no-untyped-def]
         turn, shift: (3, 3) and (3,) m, b_from_a of the cameras. moving, flat: MOVING and FLAT.
 
     Returns:
-        Counts (5,), see SEEN. Depth errors (k,), and whether each is off flat ground (k,). Ids (m,) and states (m,) of
-        the points well inside one instance: FIRM has the same depth and id in b; for MOVED, b is farther away; OTHER_ID
-        has the same depth and another id in b.
+        Counts (4,), see SEEN. Depth errors (k,), and whether each is off flat ground (k,).
     """
     height, width = depth_a.shape
     height_b, width_b = depth_b.shape
     has_ids = inst_a.shape[0] > 0 and inst_b.shape[0] > 0
-    counts = np.zeros(5, np.int64)
+    counts = np.zeros(4, np.int64)
     errors = np.empty(COLUMNS * GRID_ROWS)
     is_off_flat = np.zeros(COLUMNS * GRID_ROWS, np.bool_)
-    ids, states = np.empty(COLUMNS * GRID_ROWS, np.int64), np.empty(COLUMNS * GRID_ROWS, np.uint8)
-    num_errors, num_ids = 0, 0
+    num_errors = 0
     for j in range(GRID_ROWS):
         v = int((j + 0.5) * height / GRID_ROWS)
         for i in range(COLUMNS):
@@ -145,38 +122,23 @@ def _reproject(  # type: ignore[no-untyped-def]
                 continue
             if not (u_b < width_b - BORDER_HIGH_PX and v_b < height_b - BORDER_HIGH_PX):
                 continue
-            is_flat = flat[own & 255]
-            least_error_m, least_farther_m, is_missing, is_same, all_static, all_own, all_alike = _around(
+            least_error_m, is_missing, is_same, all_static = _around(
                 depth_b, inst_b, int(v_b), int(u_b), z, own, has_ids, moving, flat
             )
             if not all_static:
                 continue
             counts[SEEN] += 1
-            agrees = least_error_m <= TOLERANCE_SHARE * z + TOLERANCE_M
-            state = 0
-            if agrees and all_own:
-                state = FIRM
-            elif agrees and all_alike and not is_flat:
-                state = OTHER_ID
-            # Farther on all sides: a nearer point may be another side of the same instance, which hides this one.
-            elif not agrees and has_ids and (is_missing or (all_own and least_farther_m > 0.0)):
-                state = MOVED
-            if state > 0:
-                ids[num_ids], states[num_ids] = own >> 8, state
-                num_ids += 1
-            if agrees:
+            if least_error_m <= TOLERANCE_SHARE * z + TOLERANCE_M:
                 counts[AGREE] += 1
                 counts[SAME] += is_same
                 error = _error_on_plane(depth_b, u_b, v_b, z)
                 if not np.isnan(error):
                     errors[num_errors] = error
-                    is_off_flat[num_errors] = has_ids and not is_flat
+                    is_off_flat[num_errors] = has_ids and not flat[own & 255]
                     num_errors += 1
             elif is_missing:
                 counts[MISSING] += 1
-            else:
-                counts[HIDDEN] += 1
-    return counts, errors[:num_errors], is_off_flat[:num_errors], ids[:num_ids], states[:num_ids]
+    return counts, errors[:num_errors], is_off_flat[:num_errors]
 
 
 @njit(cache=True, nogil=True)
@@ -203,28 +165,22 @@ def _around(depth, instance, row, column, z, own, has_ids, moving, flat):  # typ
     """Compare the nine pixels around a place with a point at depth z, m, of the instance `own`.
 
     Returns:
-        least_error_m: the least difference in depth. least_farther_m: how much farther than the point the nearest pixel
-        is. is_missing: the point is clearly nearer than all pixels. is_same: one pixel shows its instance, or its kind
-        of flat ground. all_static: no pixel shows a moving kind. all_own: all pixels show its instance. all_alike: all
-        pixels show one instance.
+        least_error_m: the least difference in depth. is_missing: the point is clearly nearer than all pixels. is_same:
+        one pixel shows its instance, or its kind of flat ground. all_static: no pixel shows a moving kind.
     """
-    least_error_m = least_farther_m = 1e9
+    least_error_m = 1e9
     is_missing, is_same, all_static = True, not has_ids, True
-    all_own = all_alike = has_ids
     for y in range(row - 1, row + 2):
         for x in range(column - 1, column + 2):
             difference_m = float(depth[y, x]) - z
             least_error_m = min(least_error_m, abs(difference_m))
-            least_farther_m = min(least_farther_m, difference_m)
             is_missing &= difference_m > MISSING_SHARE * z + MISSING_M
             if has_ids:
                 code = _code(instance, y, x)
                 kind = code & 255
                 all_static &= not moving[kind]
                 is_same |= code == own or (kind == own & 255 and flat[kind])
-                all_own &= code == own
-                all_alike &= code == _code(instance, row, column)
-    return least_error_m, least_farther_m, is_missing, is_same, all_static, all_own, all_alike
+    return least_error_m, is_missing, is_same, all_static
 
 
 @njit(cache=True, nogil=True)

@@ -5,6 +5,7 @@ The rendered poses are measured against the map, because the poses of a perturbe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -158,12 +159,7 @@ def check_surroundings(track: Track, obstacles: BoxIndex, cfg: InspectConfig, re
 
     gaps_m = signed_distances(obstacles, track.positions_m, CLEARANCE_CAP_M)[0]
     if track.is_original:
-        path_m = track.positions_m[:, None]
-        if track.between is not None:  # frames that were not rendered
-            between_m = track.between[..., :3]
-            path_m = np.concatenate([path_m, np.where(np.isnan(between_m), path_m, between_m)], axis=1)
-        swept_m = swept_distances(obstacles, path_m.reshape(-1, 3), CLEARANCE_CAP_M)[0]
-        gaps_m = swept_m.reshape(len(track), -1).min(axis=1)
+        gaps_m = swept_distances(obstacles, track.positions_m, CLEARANCE_CAP_M)[0]
     metrics.update(clearance_min_m=float(gaps_m.min()))
     for i in np.flatnonzero((gaps_m < cfg.clearance_min_m - CLEARANCE_TOLERANCE_M) | (gaps_m <= 0)):
         code = "collision" if gaps_m[i] <= 0 else "clearance"
@@ -211,7 +207,8 @@ def check_poses(track: Track, trace: DroneTrace, report: Report) -> None:
 
     A shifted drone or target changes the aim of the camera, so rotations are compared in other frames only.
     """
-    num_planned = -(-len(trace.time_s) // track.motion.poses_a_frame)
+    stride = round(step_s(track.time_s) / step_s(trace.time_s))  # render.frame_stride
+    num_planned = math.ceil(len(trace.time_s) / max(1, stride))
     if len(track) < num_planned:
         where = "trajectory.json: points"
         report.warn("shorter_than_planned", where, f"{len(track)} frames", f"{num_planned} planned ones")

@@ -67,8 +67,7 @@ class RenderConfig(WeatherConfig):
         1,
         ge=1,
         le=100,
-        description="draw every n-th pose; those between are in trajectory.json. With pedestrians.dt_s 0.1: 1 gives "
-        "frames and actions at 10 Hz, 5 frames at 2 Hz with actions at 10 Hz",
+        description="draw every n-th pose. With pedestrians.dt_s 0.1: 1 gives frames at 10 Hz, 5 frames at 2 Hz",
     )
     debug: bool = Field(False, description="also write debug.png: boxes, ids and distances over the colours")
     visible_threshold: float = Field(

@@ -129,7 +129,6 @@ def make_track_script(
         variant=VARIANTS[track],
         number=number,
         trace=trace,
-        between=planned.between(cfg.frame_stride),
         cameras=cameras,
         perturbed=perturbed,
         gait=gait.since(len(before_m)),

@@ -58,7 +58,6 @@ class TrackScript:
     variant: str
     number: int  # index of the trajectory in its file
     trace: DroneTrace  # its drawn poses
-    between: np.ndarray | None  # planned poses that are not drawn (`Track.between`)
     cameras: tuple[Camera, ...]  # one per frame
     perturbed: PerturbedTrack
     gait: Gait
@@ -322,7 +321,6 @@ def _track(script: TrackScript, drawn: DrawnFrames) -> Track:
         segments=trace.segments,
         mission=trace.mission,
         people=script.bystanders.people(script.clothes.looks),
-        between=script.between,
         is_original=script.variant == VARIANTS["clean"],
         raw={**weather, "points": points},
     )

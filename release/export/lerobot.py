@@ -108,9 +108,9 @@ def states(rows: list[Row]) -> np.ndarray:
     """Return the motion that a drone knows at each frame, (n, 5) as ACTION: the mean velocities of the step that led
     there, and the camera's pitch. At the first frame it has not moved."""
     pose = vectors(rows, "pose", POSE)
-    time_s, nothing = np.array([row["time_s"] for row in rows]), np.empty((len(rows), 0, 6))
+    time_s = np.array([row["time_s"] for row in rows])
     # In the axes of the end of each step.
-    motion = PlannedMotion(time_s, pose, nothing, np.roll(pose[:, 4], -1), pose[:, :3])
+    motion = PlannedMotion(time_s, pose, np.roll(pose[:, 4], -1), pose[:, :3])
     found = np.zeros((len(rows), len(ACTION)))
     found[1:, :4] = motion.action[:-1, :4]
     found[:, 4] = pose[:, 3]

@@ -240,14 +240,8 @@ def _odd_pair(pair: Agreement, is_near: bool, error_most: float) -> tuple[str, s
          f"{pair.missing_share:.1%} of the points in front of the surfaces of this or the previous frame{off}",
          f"at most {GONE_MOST:.1%}, and an error of at most {error_most:.2%}, for depth, pose and camera that agree "
          "with the previous frame"),
-        (is_near and pair.moved, "scene_depth",
-         f"an object of {pair.moved} points that is farther away than in the previous frame",
-         "the same place, because it does not move"),
         (is_known and pair.same < SAME_LEAST * pair.agree, "scene_instance",
          f"{pair.same / max(1, pair.agree):.1%} of the points with the instance id of the previous frame",
          f"at least {SAME_LEAST:.0%} of the points with the same depth"),
-        (is_near and is_known and pair.other_id, "scene_instance",
-         f"an object of {pair.other_id} points with a different id from the previous frame",
-         "the same id for an object in all frames"),
     )  # fmt: skip
     return next(((code, got, expected) for is_odd, code, got, expected in rules if is_odd), None)
