@@ -27,7 +27,7 @@ STYLE = """body{font:15px/1.45 'DejaVu Sans','Noto Sans CJK SC',sans-serif;margi
 def crop(run_tree: Path, caption, index: int) -> str:
     """Return one observed frame around the target, as a JPEG data URL."""
     folders = {(f.parent.name, f.name): f for f in find_tracks(run_tree)}
-    flight = read_track(folders[caption.trajectory, caption.variant], strict=False)
+    flight = read_track(folders[caption.trajectory, caption.variant])
     image = read_rgb(flight.frame_folder(index))
     scale = image.shape[1] / 1280
     width, height = int(CROP_PX[0] * scale), int(CROP_PX[1] * scale)

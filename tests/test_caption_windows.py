@@ -34,7 +34,7 @@ def tree(tmp_path_factory):
 
 
 def flight_in(root):
-    return read_track(find_tracks(root)[0], strict=False)
+    return read_track(find_tracks(root)[0])
 
 
 @each(
@@ -59,7 +59,7 @@ def test_the_observed_type_has_no_future_and_shares_no_memory_with_it(tree):
 
 def spoil_future(root, current: int) -> None:
     folder = find_tracks(root)[0]
-    flight = read_track(folder, strict=False)
+    flight = read_track(folder)
     rng = np.random.default_rng(1)
     later = np.arange(len(flight)) > current
 
@@ -207,7 +207,7 @@ def two_tracks(tmp_path_factory):
 
 
 def flights_of(root) -> tuple[Track, Track]:
-    clean, perturbed = (read_track(folder, strict=False) for folder in find_tracks(root))
+    clean, perturbed = (read_track(folder) for folder in find_tracks(root))
     return clean, perturbed
 
 

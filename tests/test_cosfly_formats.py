@@ -162,7 +162,6 @@ def test_a_record_is_read_as_it_was_written_and_tells_lead_and_decisions_apart(t
 @each(("change", "words"), [
     ({"frames": [{"time_s": 0.5}]}, "missing|required"),
     ({"ended": "tired"}, "finished"),
-    ({"num_walk_frames": 1}, "2 frames follow the first decision"),
     ({"colour": "red"}, "[Ee]xtra"),
 ])  # fmt: skip
 def test_a_record_that_cannot_be_is_refused(tmp_path, change, words):
@@ -171,14 +170,6 @@ def test_a_record_that_cannot_be_is_refused(tmp_path, change, words):
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(InputError, match=words):
         read_episode(path)
-
-
-def test_answers_come_in_order_and_only_the_last_frame_has_no_command():
-    for answers in (("ok", "lead", "end"), ("ok", "end", "end"), ("lead", "ok"), ("lead", "lead")):
-        with pytest.raises(ValueError, match="lead"):
-            record(answers)
-    with pytest.raises(ValueError, match="command"):
-        record(frames=(frame(0, "ok", command=None), frame(0.5, "end")))
 
 
 def picture_of(columns: dict[int, int]) -> SeenFrame:

@@ -99,7 +99,7 @@ READERS = {
     "city model": Reader("city.json", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
     "SimWorld": Reader("world.json", lambda path: simworld.load(simworld.SimWorldConfig(world=path))),
     "flight": Reader(f"{FLIGHT}/trajectory.json", lambda path: read_track(path.parent)),
-    "flight, tolerant": Reader(f"{FLIGHT}/trajectory.json", lambda path: read_track(path.parent, strict=False)),
+    "flight, tolerant": Reader(f"{FLIGHT}/trajectory.json", lambda path: read_track(path.parent)),
     "annotation": Reader(f"{FRAME}/meta.json", lambda path: read_meta(path.parent)),
     "picture": Reader(f"{FRAME}/rgb.png", lambda path: read_rgb(path.parent)),
     "instances": Reader(f"{FRAME}/instance.png", lambda path: read_instance(path.parent)),

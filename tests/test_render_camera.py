@@ -43,7 +43,7 @@ from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.render.weather import path_seed, read_pools, weather_of
 from cosfly.runtime.config import build
-from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.errors import ConfigError
 from cosfly.runtime.json_io import read_json
 from cosfly.viz.topview import TopView
 from release.columns import INTRINSICS, Placement, matrices_of, scalar_row
@@ -101,9 +101,7 @@ def test_the_cameras_of_a_flight_survive_the_file(tmp_path):
     )
     assert row["fov_deg"] == pytest.approx(found.camera_at(7).fov_deg, abs=1e-6)
     change_json(folder / "trajectory.json", lambda raw: raw["points"][3]["camera"].update(intrinsic=[[0, 0, 0]] * 3))
-    with pytest.raises(InputError, match=r"points\[3\]\.camera\.intrinsic"):
-        read_track(folder)
-    assert any("points[3].camera" in issue for issue in read_track(folder, strict=False).issues)
+    assert any("points[3].camera.intrinsic" in str(issue) for issue in read_track(folder).issues)
     write_track(folder, replace(flight, intrinsics=None))  # one camera is said once
     assert all("camera" not in point for point in json.loads((folder / "trajectory.json").read_text())["points"])
     assert read_track(folder).intrinsics is None

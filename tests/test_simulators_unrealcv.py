@@ -66,7 +66,7 @@ def same_boxes(exported: BoxMap, town: BoxMap) -> None:
 def test_a_served_town_comes_back_as_it_is(tmp_path):
     town = invent(SyntheticConfig(), 3)
     with serving(town, tmp_path / "town", protocol="unrealcv") as port:
-        settings = f"maps.unrealcv={{port: {port}, most_default: 0.01}}"
+        settings = f"maps.unrealcv={{port: {port}}}"
         words = ["maps", "--source", "unrealcv", "--set", settings, "--out", str(tmp_path / "out")]
         done = invoke(words)
     assert done.exit_code == 0, done.output

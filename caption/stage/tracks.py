@@ -46,7 +46,7 @@ class TrackInput:
 
     def windows(self, cfg: CaptionConfig) -> Iterator[Window]:
         """Yield the windows in order of time; InputError if the track or its clean twin cannot be read."""
-        track = replace(read_track(self.folder, strict=False), given_id=self.name)
+        track = replace(read_track(self.folder), given_id=self.name)
         try:
             twin = read_twin(track)
         except VerifyError as error:  # it has other frames

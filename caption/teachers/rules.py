@@ -16,9 +16,10 @@ from itertools import islice, pairwise
 from pathlib import Path
 
 from caption.teachers.rule_decisions import LEAST_TURN_DEG, decide, expected_sizes, is_shaken, ranked, sight_rate_dps
-from caption.verification.facts import Facts, wrapped
+from caption.verification.facts import Facts
 from caption.verification.references import Fact, look_up, parse_reference
 from cosfly.formats.segments import MISSION_KINDS
+from cosfly.geometry.axes import wrap_deg
 from cosfly.runtime.config import read_yaml
 
 MODEL = "rules-17"  # its name in the records; counts changes of decisions and wording
@@ -151,7 +152,7 @@ def _walk_deg(f: Facts) -> float | None:
     is_unclear = is_shaken(f) and (f.target_speed_mps or 0.0) < CLEAR_WALK_MPS
     if course is None or bearing is None or is_unclear or not walks(f, 0):
         return None
-    return abs(wrapped(course - f.heading_deg[-1] - bearing))
+    return abs(wrap_deg(course - f.heading_deg[-1] - bearing))
 
 
 def crosses(f: Facts, side: int) -> bool:

@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from caption.schema import ObservedFrame, ObservedWindow
+from cosfly.geometry.axes import wrap_deg
 
 VisibilityWord = Literal["visible", "partly_occluded", "illegible", "occluded", "out_of_view"]
 Series = Sequence[float | None]
@@ -132,7 +133,7 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
     xs, ys, zs = zip(*[frame.position_m for frame in frames], strict=True)
     seen = tuple([distance_m is not None for distance_m in by_frame["distance_m"]])
     step_s = (frames[-1].time_s - frames[0].time_s) / (count - 1)
-    turns_deg = [wrapped(after.rotation_deg[1] - before.rotation_deg[1]) for before, after in pairwise(frames)]
+    turns_deg = [wrap_deg(after.rotation_deg[1] - before.rotation_deg[1]) for before, after in pairwise(frames)]
     yaw_deg = [0.0, *accumulate(turns_deg)]
     is_known = (True,) * count
     (v_x, v_y, v_z), local = _velocities((xs, ys, zs), is_known, step_s, SMOOTH_M)
@@ -207,7 +208,7 @@ def _measure_target(
         "target_velocity_mps": None if speed is None else velocity,
         "target_speed_mps": speed,
         # The heading of someone who stands is noise.
-        "target_turn_deg": _round(wrapped(known[-1] - known[0]), 1) if known and len(known) == sum(seen) else None,
+        "target_turn_deg": _round(wrap_deg(known[-1] - known[0]), 1) if known and len(known) == sum(seen) else None,
     }
 
 
@@ -266,7 +267,7 @@ def _velocities(
 def _measure_frame(frame: ObservedFrame, camera_px: tuple[int, int], picture_px: tuple[int, int]) -> tuple[Any, ...]:
     """Measure one frame; return BY_FRAME."""
     (x, y, z), (u, v, w), (pitch, heading, _) = frame.position_m, frame.target_m, frame.rotation_deg
-    drone = (_round(z, 1), _round(pitch, 1), _round(wrapped(heading), 1))
+    drone = (_round(z, 1), _round(pitch, 1), _round(wrap_deg(heading), 1))
     word = _word(frame)
     if u != u or word in ("occluded", "out_of_view"):
         return (*drone, *(None,) * 9, word)
@@ -274,7 +275,7 @@ def _measure_frame(frame: ObservedFrame, camera_px: tuple[int, int], picture_px:
     away_x, away_y, away_z = u - x + 0.0, v - y + 0.0, w - z + 0.0
     distance = math.hypot(away_x, away_y)
     slant = math.hypot(distance, away_z)
-    bearing = wrapped(math.degrees(math.atan2(away_y, away_x)) - heading)
+    bearing = wrap_deg(math.degrees(math.atan2(away_y, away_x)) - heading)
     depression = math.degrees(math.atan2(-away_z, distance))
     x_scale, y_scale = picture_px[0] / camera_px[0], picture_px[1] / camera_px[1]
     left, top, right, bottom = frame.target_bbox
@@ -286,11 +287,6 @@ def _measure_frame(frame: ObservedFrame, camera_px: tuple[int, int], picture_px:
     offsets = (centre_x - picture_px[0] / 2.0, centre_y - picture_px[1] / 2.0)
     in_space = _rounded((distance, slant, -away_z, bearing, depression), 1)
     return (*drone, *in_space, *_rounded((right - left, bottom - top, *offsets), None), word)
-
-
-def wrapped(angle_deg: float) -> float:
-    """Return an angle in [-180, 180)."""
-    return (angle_deg + 180.0) % 360.0 - 180.0
 
 
 def _round(value: float, digits: int) -> float:

@@ -22,7 +22,8 @@ from itertools import pairwise
 from operator import attrgetter
 from typing import Literal, NamedTuple
 
-from caption.verification.facts import STANDING_MPS, Facts, Series, wrapped
+from caption.verification.facts import STANDING_MPS, Facts, Series
+from cosfly.geometry.axes import wrap_deg
 
 Missing = Literal["unobserved_frame", "unknown_fact"]
 HOVERING_MPS = 0.3  # slower than this the drone hovers
@@ -201,7 +202,7 @@ def _word(name: str, f: Facts, at: int) -> str | None:
             course, bearing = f.target_headings_deg[at], f.bearing_deg[at]
             if course is None or bearing is None:
                 return None
-            off_deg = abs(wrapped(course - f.heading_deg[at] - bearing))
+            off_deg = abs(wrap_deg(course - f.heading_deg[at] - bearing))
             return "away" if off_deg < ACROSS_DEG else "towards" if off_deg > 180.0 - ACROSS_DEG else "across"
         case "target_motion":
             speed = f.target_speed_mps if at == _NOW else f.target_speeds_mps[at]
@@ -268,7 +269,7 @@ def _change(name: str, values: Sequence[float]) -> float | None:
     if len(values) < 2:
         return None
     change = values[-1] - values[0]
-    return wrapped(change) if name == "target_heading" else change
+    return wrap_deg(change) if name == "target_heading" else change
 
 
 def _centred_px(facts: Facts) -> float:

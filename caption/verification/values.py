@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
-from caption.verification.facts import Facts, Series, wrapped
+from caption.verification.facts import Facts, Series
 from caption.verification.glossary import ends_of_clauses, mentioned, mentions
 from caption.verification.numerals import Numeral, read_numerals
 from cosfly.formats.captions import Language, ValueCounts
+from cosfly.geometry.axes import wrap_deg
 
 LONGEST = 500  # characters of a sentence that is read; a model that repeats itself ends none
 SHOWN = 80  # characters of a clause in a message
@@ -160,7 +161,7 @@ def _differences(unit: str, facts: Facts) -> Iterator[float]:
     for of_drone, of_target in pairs.get(unit, ()):
         for a, b in zip(of_drone, of_target, strict=True):
             if a is not None and b is not None:
-                yield abs(wrapped(b - a)) if unit == "deg" else abs(b - a)
+                yield abs(wrap_deg(b - a)) if unit == "deg" else abs(b - a)
 
 
 def _matches_any(numeral: Numeral, name: str, facts: Facts) -> bool:

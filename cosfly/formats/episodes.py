@@ -8,13 +8,11 @@ World axes: right-handed, metres, degrees.
 from __future__ import annotations
 
 from collections import Counter
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, NonNegativeInt, model_validator
 
-from cosfly.geometry.motion import ACTION
 from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
 EPISODES = "episodes"  # folder of the records
@@ -93,27 +91,6 @@ class Episode(Record):
     ended: Ended
     num_walk_frames: int = Field(ge=1)
     frames: tuple[EpisodeFrame, ...] = Field(min_length=2)
-
-    @model_validator(mode="after")
-    def _is_consistent(self) -> Self:
-        answers = [frame.answer for frame in self.frames]
-        times_s = [frame.time_s for frame in self.frames]
-        last = len(answers) - 1
-        for i, answer in enumerate(answers):
-            if (answer == "end") != (i == last) or (answer == "lead" and i >= self.num_lead):
-                raise ValueError(
-                    f"frame {i} has the answer `{answer}`; the answer must be `lead` before the first decision, "
-                    "`end` in the last frame, and a decision in all other frames"
-                )
-        if any(later <= earlier for earlier, later in pairwise(times_s)):
-            raise ValueError("the field time_s must increase from frame to frame")
-        if any((frame.command is None) != (frame.answer == "end") for frame in self.frames):
-            raise ValueError(f"each frame must have a command ({', '.join(ACTION)}), except the last, which has none")
-        if len(self.flown) > self.num_walk_frames:
-            raise ValueError(
-                f"{len(self.flown)} frames follow the first decision, but num_walk_frames allows {self.num_walk_frames}"
-            )
-        return self
 
     @property
     def num_lead(self) -> int:

@@ -121,7 +121,7 @@ class Track:
     is_original: bool = True
     folder: Path | None = None
     raw: dict = field(default_factory=dict)
-    issues: tuple[str, ...] = ()  # deviations that a tolerant reader accepted
+    issues: tuple[InputError, ...] = ()  # deviations from the layout
     run: str = ""  # set if tracks of several runs are combined
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
@@ -288,16 +288,14 @@ def _was_moved(offsets: np.ndarray, flag: object) -> bool | None:
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
-def read_track(folder: Path, *, strict: bool = True) -> Track:
+def read_track(folder: Path) -> Track:
     """Read one track's folder.
 
-    Args:
-        strict: True requires every rule of the layout. False accepts older names and missing optional fields and lists
-            them in `Track.issues`. Poses and times must be finite in both cases.
+    Older names and missing optional fields are accepted and listed in `Track.issues`. Poses and times must be finite.
     """
     path = folder / "trajectory.json"
     raw = read_object(path, what="trajectory", tree=tree_of_track(folder))
-    reader = _FieldReader(path, strict)
+    reader = _FieldReader(path)
     _, town, trajectory, variant = astuple(place_of(folder))
     for name, expected in (("schema", SCHEMA), ("schema_version", SCHEMA_VERSION), ("trace_dir", variant)):
         reader.equal(name, raw.get(name), expected)
@@ -345,32 +343,26 @@ def read_track(folder: Path, *, strict: bool = True) -> Track:
 
 
 class _FieldReader:
-    """Reads and checks the fields of one file. A deviation raises if `strict`; otherwise `issues` records it."""
+    """Reads and checks the fields of one file; `issues` records deviations."""
 
-    def __init__(self, path: Path, strict: bool) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        self.strict = strict
-        self.issues: list[str] = []
+        self.issues: list[InputError] = []
 
     def error(self, message: str, where: str, got: object, expected: str) -> InputError:
         if got == "null":
             return InputError(MISSING, where=f"{self.path}: {where}", expected=expected)
         return InputError(message, where=f"{self.path}: {where}", got=str(got), expected=expected)
 
-    def note(self, error: InputError) -> None:
-        if self.strict:
-            raise error
-        self.issues.append(str(error))
-
     def issue(self, where: str, got: object, expected: str) -> None:
-        self.note(self.error("the field does not follow the format of the file", where, got, expected))
+        self.issues.append(self.error("the field does not follow the format of the file", where, got, expected))
 
     def optional(self, read: Callable[[], Value]) -> Value | None:
         """Return an optional field; record an issue and return None if its content is invalid."""
         try:
             return read()
         except InputError as error:
-            self.note(error)
+            self.issues.append(error)
             return None
 
     def equal(self, where: str, got: object, expected: object) -> None:
@@ -378,7 +370,9 @@ class _FieldReader:
             self.issue(where, shown(got), shown(expected))
 
     def points(self, raw: dict) -> list[dict]:
-        points = raw.get("points", None if self.strict else raw.get("waypoints"))
+        if "points" not in raw:
+            self.issue("points", "missing", "a list of objects")
+        points = raw.get("points", raw.get("waypoints"))
         if not isinstance(points, list) or not points or not all(isinstance(p, dict) for p in points):
             raise self.error("the field is not a list of objects", "points", json_type(points), "a list of objects")
         for i, point in enumerate(points):
@@ -402,13 +396,15 @@ class _FieldReader:
     def time(self, i: int, point: dict) -> float:
         timing = object_of(point, "timing")
         where = f"points[{i}].timing"
-        if self.strict or "trace_timestamp" in timing:
+        if "trace_timestamp" in timing:
             return self.number(where, timing, "trace_timestamp")
+        self.issue(f"{where}.trace_timestamp", "missing", "a finite number")
         return self.number(where, timing if "timestamp" in timing else point, "timestamp")
 
     def number(self, where: str, group: Any, name: str) -> float:
         value = group.get(name) if isinstance(group, dict) else None
-        if value is None and name in ("pitch", "roll") and not self.strict:
+        if value is None and name in ("pitch", "roll"):
+            self.issue(f"{where}.{name}", "null", "a finite number")
             return 0.0
         if value is None or not is_number(value):
             raise self.error("the field is not a number", f"{where}.{name}", shown(value), "a finite number")

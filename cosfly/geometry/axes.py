@@ -10,7 +10,11 @@ CARLA and Unreal are left-handed (y to the right, yaw clockwise): `mirror_poses`
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
+
+Angle = TypeVar("Angle", float, np.ndarray)
 
 DT_S = 0.5  # the paper's time step (2 Hz); `pedestrians.dt_s` sets another for all stages
 
@@ -124,9 +128,9 @@ def box_iou(first: np.ndarray, second: np.ndarray) -> float:
     return shared / union if union > 0 else 0.0
 
 
-def wrap_deg(angle_deg: np.ndarray | float) -> np.ndarray | float:
-    """Return angles of any shape, degrees, in [-180, 180)."""
-    return (np.asarray(angle_deg) + 180.0) % 360.0 - 180.0
+def wrap_deg(angle_deg: Angle) -> Angle:
+    """Return an angle, or angles of any shape, degrees, in [-180, 180)."""
+    return (angle_deg + 180.0) % 360.0 - 180.0
 
 
 def mirror_poses(poses: np.ndarray) -> np.ndarray:

@@ -139,7 +139,7 @@ def _unreadable(outcome: Failed, planned: list[DroneTrace], data: Path) -> Track
     report = Report()
     report.error("unreadable", outcome.id, outcome.message.replace(f"{data}/", ""), "a track that can be read")
     try:
-        plan_id = trace_id(read_track(data / outcome.id, strict=False))
+        plan_id = trace_id(read_track(data / outcome.id))
     except InputError:
         plan_id = ""
     return TrackInspection(

@@ -117,14 +117,12 @@ def trace_id(track: Track) -> str:
 
 
 def _read(folder: Path, report: Report) -> Track:
-    """Read a track strictly; if only its layout is broken, report that and continue."""
-    try:
-        return read_track(folder)
-    except InputError as error:
-        track = read_track(folder, strict=False)  # raises if poses or times are unusable
+    """Read a track, which raises if poses or times are unusable; report the first deviation from the layout."""
+    track = read_track(folder)
+    for error in track.issues[:1]:
         where = str(error.where).replace(f"{folder}/", "")
-        report.error("layout", where, error.got or error.what, error.expected or "the strict layout")
-        return track
+        report.error("layout", where, error.got or error.what, error.expected or "the public layout")
+    return track
 
 
 def check_plan(

@@ -22,7 +22,7 @@ from cosfly.formats.boxes import BoxMap, MapHeader, MapSource, make_box_map
 from cosfly.formats.kinds import KIND_NAMES, KINDS
 from cosfly.maps.boxlist import GroundHeight, MapLicence, served
 from cosfly.maps.simworld import read_sizes
-from cosfly.runtime.errors import InputError, counts_text
+from cosfly.runtime.errors import counts_text
 from cosfly.runtime.json_io import write_json
 from cosfly.simulators.assets import asset_of, id_of, is_no_part_of_town, kind_of
 from cosfly.simulators.conventions import CM_PER_M, world_pose
@@ -49,9 +49,6 @@ class UnrealCvMapConfig(UnrealCvConfig):
     ground_z_m: GroundHeight = None
     # objects longer than this both ways and higher than 2 m, landscapes, are dropped and counted, m
     huge_m: ClassVar[float] = 150.0
-    most_default: float | None = Field(
-        None, ge=0, le=1, description="largest share of boxes with a default size; null: no limit"
-    )
 
     def inputs(self) -> dict[str, Path]:
         return {f"sizes_{k}": path for k, path in enumerate(self.sizes)}
@@ -114,15 +111,6 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
         used.append((item.name, item.class_name, source))
     sources = [source for _, _, source in used]
     counts = {source: sources.count(source) for source in SOURCES}
-    share = counts["default"] / max(1, len(rows))
-    if cfg.most_default is not None and share > cfg.most_default:
-        without_size = Counter(class_name for _, class_name, source in used if source == "default")
-        raise InputError(
-            "too many boxes have a default size, because the server does not return their bounds", where=where,
-            got=f"{share:.1%}: {', '.join(f'{name} ({num})' for name, num in without_size.most_common(5))}",
-            expected=f"at most {cfg.most_default:.1%} of the boxes (maps.unrealcv.most_default)",
-            fix="add a table with the sizes of these assets to maps.unrealcv.sizes, or correct their bounds",
-        )  # fmt: skip
     header = MapHeader(
         name=cfg.name or level or "Unreal", source=MapSource(tool="UnrealCV", version=version, file=level),
         licence=cfg.licence, credits=cfg.credits, extent_sources=counts,

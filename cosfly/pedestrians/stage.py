@@ -99,15 +99,15 @@ def _draw_route(
             continue
         with timed(seconds, "astar"):
             cells = ground.route(start, goal)
-        if cfg.max_detour and route_cost(cells) > cfg.max_detour * np.hypot(*(cells[-1] - cells[0])):
+        if route_cost(cells) > cfg.max_detour * np.hypot(*(cells[-1] - cells[0])):
             retries["detour"] += 1
             continue
         return ground.grid.centers_of(cells), retries
     raise NoPathError(
         "no random pair of start and goal has a suitable route", where=path_id,
         got=f"{cfg.num_retries + 1} tries: {retries['no_goal']} without a goal, {retries['detour']} with a long detour",
-        expected=f"a goal {cfg.min_distance_m:g} to {cfg.max_distance_m:g} m away and a route within max_detour",
-        fix="in the section pedestrians, lower min_distance_m or raise max_distance_m, max_detour or num_retries",
+        expected=f"a goal {cfg.min_distance_m:g} to {cfg.max_distance_m:g} m away, and a route without a long detour",
+        fix="in the section pedestrians, lower min_distance_m or raise max_distance_m or num_retries",
     )  # fmt: skip
 
 

@@ -64,7 +64,7 @@ class PedestriansConfig(Config):
     num_retries: int = Field(
         5, ge=0, description="number of further pairs of start and goal to try if the first is rejected"
     )
-    max_detour: float = Field(3.0, ge=0, description="largest ratio of route length to straight distance; 0: no limit")
+    max_detour: ClassVar[float] = 3.0  # largest ratio of route length to straight distance
     ground: Literal["anywhere", "surfaces", "paved"] = Field(
         "surfaces",
         description="walkable ground: anywhere; surfaces: ground boxes, if the map has them; paved: paved ones only",
@@ -73,7 +73,6 @@ class PedestriansConfig(Config):
         1, ge=1, le=100, description="cost of a metre of carriageway off crossings, in metres of pavement; 1: all "
         "ground costs the same, as in the paper; above 1 no trajectory starts or ends on it",
     )  # fmt: skip
-    open_cost: int = Field(1, ge=1, le=100, description="cost of a metre of open ground, in metres of pavement")
     cruise_speed_mps: ClassVar[float] = 1.2  # speed on straight ground, m/s
     curvature_gain_m: ClassVar[float] = 5.0  # alpha of eq:speed, m
     speed_jitter: ClassVar[float] = 0.15  # beta of eq:speed: random share of the speed
@@ -122,8 +121,6 @@ class PedestriansConfig(Config):
             problems.append(
                 f"look_alikes ({self.look_alikes}) must not be above others ({self.others}), which include them"
             )
-        if 0 < self.max_detour < 1:
-            problems.append(f"max_detour ({self.max_detour}) must be at least 1, or 0 for no limit")
         if problems:
             raise ValueError("; ".join(problems))
         return self
@@ -254,7 +251,7 @@ def walkable_ground(
         text = "%s: %d walkable cells in areas below pedestrians.min_component_cells=%d are not used (areas: %d)"
         log.info(text, where, num_left_out, cfg.min_component_cells, num_areas)
     with timed(seconds, "footing"):
-        costs = costs_of(cfg.open_cost, cfg.road_cost)
+        costs = costs_of(cfg.road_cost)
         footing = footing_of(box_map, grid)
     ground = WalkableGround(grid, inflated, parts, footing, box_map.ground_z_m, costs, is_in_roi, counts)
     if not ground.row_ends[-1]:
@@ -395,10 +392,10 @@ def _morphed(mask: np.ndarray, operation: int, width_m: float, grid: grids.Occup
     return cv2.morphologyEx(mask.view(np.uint8), operation, disc).view(bool)
 
 
-def costs_of(open_cost: int, road_cost: int) -> np.ndarray:
+def costs_of(road_cost: int) -> np.ndarray:
     """Return the cost of a step of one cell on each footing, (NUM_FOOTINGS,) int64, at least 1."""
     costs = np.ones(NUM_FOOTINGS, dtype=np.int64)
-    costs[OPEN], costs[ROAD] = open_cost, road_cost
+    costs[ROAD] = road_cost
     return costs
 
 

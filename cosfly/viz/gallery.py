@@ -34,7 +34,7 @@ BOX_COLOR = (255, 214, 10)
 def contact_sheet(tree: Path, out_png: Path, choice: TrackChoice = ALL_TRACKS) -> None:
     """Read a playback tree and write a PNG: a few RGB frames, a depth image and a mask of each track."""
     folders = find_tracks(tree, choice)
-    rows = [_row(read_track(folder, strict=False)) for folder in folders[:MOST_ROWS]]
+    rows = [_row(read_track(folder)) for folder in folders[:MOST_ROWS]]
     heading = np.full((26, rows[0].shape[1], 3), 60, np.uint8)
     shown = "" if len(folders) <= MOST_ROWS else f", the first {MOST_ROWS} shown"
     draw_text(heading, f"{len(folders)} tracks{shown}", 8, 18, 0.5, (255, 255, 255))
@@ -101,7 +101,7 @@ def best_frame(tree: Path, *names: str) -> Path:
 def _first_clean(tree: Path, choice: TrackChoice, *names: str) -> tuple[Track, list[int]]:
     """Return the first clean track of a tree, or without clean ones the first, and its frames that have these files."""
     folders = find_tracks(tree, choice)
-    track = read_track(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
+    track = read_track(next((f for f in folders if f.name == "ORI"), folders[0]))
     return track, _frames_with(track, *names)
 
 

@@ -68,7 +68,7 @@ def run(
     notes = list[str]()
     pedestrians = [] if paths is None else read_paths(paths)
     tracks = [_of_trace(trace) for path in traces for trace in read_traces(path)]
-    all_drawn = [] if data is None else [read_track(folder, strict=False) for folder in find_tracks(data)]
+    all_drawn = [] if data is None else [read_track(folder) for folder in find_tracks(data)]
     town_drawn = [drawn for drawn in all_drawn if town_folder(drawn.town) == town_folder(box_map.name)] or all_drawn
     if len(town_drawn) < len(all_drawn):
         notes.append(f"{len(all_drawn) - len(town_drawn):,} tracks of other towns are not shown")

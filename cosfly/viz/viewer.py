@@ -88,7 +88,7 @@ def run(
     with progress_bar("viewer: tracks", len(tracks)) as advance:
         for place, shown in tracks.items():
             try:
-                track = read_track(shown.path, strict=False)
+                track = read_track(shown.path)
             except InputError as error:
                 notes.append(f"not shown: {place.trajectory}/{place.variant}: {error.what}")
             else:

@@ -125,7 +125,7 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
 
 def _read_pair(folder: Path, cfg: DualTrackConfig) -> tuple[Track, Track] | str | None:
     """Read a perturbed track and its clean one; None for a clean track, a reason if there are no windows."""
-    track = read_track(folder, strict=False)
+    track = read_track(folder)
     if track.is_original:
         return None
     try:

@@ -199,7 +199,7 @@ class _Tracks:
         self._cfg, self._sources = cfg, sources
         self._frames: dict[Path, frozenset[int]] = {}  # of a track: those that have all files of the views
         self.courses: list[Course] = []
-        self._read = lru_cache(maxsize=4)(lambda folder: read_track(folder, strict=False))
+        self._read = lru_cache(maxsize=4)(lambda folder: read_track(folder))
         trees = [(source.run, source.data) for source in sources] if len(sources) > 1 else []
         self._ids = flight_ids([track_place(folder, run) for run, tree in trees for folder in find_tracks(tree)])
 

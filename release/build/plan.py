@@ -137,9 +137,9 @@ def survey_tracks(
 def open_track(candidate: Candidate) -> Track:
     """Read a track under the name that it has in the release: trees of cosfly strictly, those of others as far as the
     public layout demands."""
-    track = read_track(candidate.folder, strict=False)
+    track = read_track(candidate.folder)
     if track.is_ours and track.issues:
-        track = read_track(candidate.folder)  # raises the issue
+        raise track.issues[0]
     return replace(track, run=candidate.place.run, given_id=candidate.flight_id)
 
 

@@ -51,7 +51,7 @@ def frames_of(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
     The patch is GRID * GRID where the target is not to be seen.
     """
-    track = read_track(folder, strict=False)
+    track = read_track(folder)
     pictures, wanted = [], []
     for index in range(len(track)):
         path = folder / frame_name(index) / FILE_NAMES["rgb"]
