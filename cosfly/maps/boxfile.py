@@ -29,7 +29,7 @@ from shapely.geometry import LineString, Point, Polygon, shape
 
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, MapHeader, MapSource, read_boxes
 from cosfly.formats.columns import LARGEST
-from cosfly.formats.kinds import GROUND_KINDS, KINDS, SURFACE_KINDS
+from cosfly.formats.kinds import GROUND_KINDS, KINDS
 from cosfly.maps.boxlist import WIDEST_M, BoxList, MapLicence, MapName, SkippedEntries, listed, origin_m, required
 from cosfly.maps.footprints import (
     CUT_SHARES,
@@ -39,7 +39,6 @@ from cosfly.maps.footprints import (
     cover,
     num_cuts,
     oriented_rectangle,
-    overlaps,
     polygons_of,
     with_derived_ground,
 )
@@ -163,7 +162,7 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
             where="maps.boxes",
             fix=f"remove the settings {', '.join(f'maps.boxes.{name}' for name in sorted(of_tables))}",
         )
-    box_map, rows = (read_boxes(path), []) if suffix == ".json" else _read_rows(cfg, path, suffix)
+    box_map = read_boxes(path) if suffix == ".json" else _read_rows(cfg, path, suffix)
     settings = cfg.model_dump(include=cfg.model_fields_set & {"name", "licence", "credits"})
     source = MapSource(tool=box_map.header.source.tool or "boxes", file=path.name)
     header = box_map.header.model_copy(update={**settings, "source": source})
@@ -174,32 +173,11 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
         header = header.model_copy(update={"offset_m": dict(zip("xyz", origin.tolist(), strict=True))})
         box_map = replace(box_map, centers=box_map.centers - origin)
     box_map = replace(box_map, header=header)
-    log.info("%s: %s", path.name, plausibility(box_map, rows))
     return with_derived_ground(box_map) if cfg.derive_ground else box_map
 
 
-def plausibility(box_map: BoxMap, rows: Sequence[int] = ()) -> str:
-    """Return one line that shows a user mistaken units, axes and angles. rows: that of each box in its file."""
-    low, high = box_map.bounds()
-    is_solid = ~box_map.is_any_of(SURFACE_KINDS)
-    solid = box_map.select(is_solid)
-    text = f"{len(box_map)} boxes, {' x '.join(f'{size:.6g}' for size in high - low)} m"
-    if not len(solid):
-        return text
-    yaws_deg = solid.rotations_deg[:, 1]
-    feet_m = solid.mins[:, 2] - solid.ground_z_m
-    heights_m = 2 * solid.half_extents[:, 2]
-    pairs, row_of_box = overlaps(solid), (np.array(rows) if len(rows) else np.arange(len(box_map)))[is_solid]
-    overlapping = np.unique(pairs[np.ptp(row_of_box[pairs], axis=1) > 0])
-    return (
-        f"{text}; obstacles {heights_m.min():.4g} to {heights_m.max():.4g} m high, bases {feet_m.min():.4g} to "
-        f"{feet_m.max():.4g} m above the ground, yaw {yaws_deg.min():.4g} to {yaws_deg.max():.4g} degrees, "
-        f"{len(overlapping) / len(solid):.0%} overlap another obstacle"
-    )
-
-
-def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> tuple[BoxMap, list[int]]:
-    """Return the boxes of a table or of features, and the row of each."""
+def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
+    """Return the boxes of a table or of features."""
     rows, units = (_table_rows(cfg, path), cfg.units) if suffix == ".csv" else _feature_rows(cfg, path)
     if not rows:
         raise InputError("the file has no boxes", where=path, expected="at least one row or feature with a box")
@@ -245,7 +223,7 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> tuple[BoxMap, list[
     box_map = boxes.box_map(header.model_copy(update=update))
     if ids and len(set(row_of_box)) == len(box_map):  # no row became several boxes
         box_map = replace(box_map, ids=np.array([ids[k] for k in row_of_box], dtype=np.uint64))
-    return box_map, row_of_box
+    return box_map
 
 
 def _in_metres(rows: list[_Row], units: Units, path: Path, *, is_table: bool) -> list[_Row]:

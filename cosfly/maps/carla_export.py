@@ -6,7 +6,6 @@ a size, one huge box around all of the terrain or the vegetation, and roads with
 
 from __future__ import annotations
 
-import logging
 import multiprocessing
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
@@ -25,13 +24,8 @@ from cosfly.runtime.io import sha256_bytes
 from cosfly.simulators.carla_client import CarlaConfig, connect
 from cosfly.simulators.conventions import world_pose
 
-log = logging.getLogger(__name__)
-
 HUGE_KINDS = ("Terrain", "Vegetation")
 SLAB_M = 2.0  # huge boxes that are lower are ground
-ROAD_STEP_M = 25.0  # between the points on roads
-ALONG_M = 60.0  # largest distance of a point on a road from the nearest box
-SLOPE_M = 1.0  # roads with a larger range of heights are not on flat ground
 
 
 class CarlaMapConfig(CarlaConfig):
@@ -56,11 +50,10 @@ class CarlaTown:
     version: str
     rows: list[tuple[str, int, str, tuple[float, ...]]] = field(default_factory=list)
     empty_labels: list[str] = field(default_factory=list)
-    road_points_m: list[tuple[float, float, float]] = field(default_factory=list)
 
 
 def ask(cfg: CarlaConfig) -> CarlaTown:
-    """Ask the server for all objects and road points; runs in its own process, because the client can crash."""
+    """Ask the server for all objects; runs in its own process, because the client can crash."""
     connection = connect(cfg, cfg.port)
     answers = CarlaTown(connection.town, connection.version)
     labels = connection.carla.CityObjectLabel.names.items()
@@ -77,9 +70,6 @@ def ask(cfg: CarlaConfig) -> CarlaTown:
                 turn = item.bounding_box.rotation
                 box = (center.x, center.y, center.z, half.x, half.y, half.z, turn.pitch, turn.yaw, turn.roll)
                 answers.rows.append((name, item.id, item.name, box))
-        for waypoint in connection.world.get_map().generate_waypoints(ROAD_STEP_M):
-            location = waypoint.transform.location
-            answers.road_points_m.append((location.x, location.y, location.z))
     return answers
 
 
@@ -120,9 +110,7 @@ def box_map_of(answers: CarlaTown, cfg: CarlaMapConfig) -> BoxMap:
     centers, halves, turns, kinds = zip(*rows.values(), strict=True) if rows else ((),) * 4
     box_map = make_box_map(centers, halves, turns, kinds, list(rows), header)
     fix = "load a town whose objects have bounding boxes"
-    box_map = served(box_map, cfg.ground_z_m, box_map.kinds == KINDS["Roads"], where, fix)
-    _report(answers, box_map, where)
-    return box_map
+    return served(box_map, cfg.ground_z_m, box_map.kinds == KINDS["Roads"], where, fix)
 
 
 def _unfit(label: str, box: np.ndarray, cfg: CarlaMapConfig) -> str:
@@ -133,27 +121,3 @@ def _unfit(label: str, box: np.ndarray, cfg: CarlaMapConfig) -> str:
         return "no size"
     is_huge = label in HUGE_KINDS and (2 * box[3:5] > cfg.huge_m).all() and 2 * box[5] > SLAB_M
     return "huge" if is_huge else ""
-
-
-def _report(answers: CarlaTown, box_map: BoxMap, where: str) -> None:
-    """Log the known defects of such exports."""
-    header = box_map.header
-    if answers.empty_labels:
-        log.info("%s: the town has no objects with the labels %s", where, ", ".join(answers.empty_labels))
-    tops_m = box_map.maxs[box_map.kinds == KINDS["Roads"], 2]
-    if num := header.model_extra and header.model_extra["repeated_ids"]:
-        log.warning("%s: %d objects had the id of another object and got a new id", where, num)
-    if len(tops_m) and np.ptp(tops_m) > SLOPE_M:
-        log.warning(
-            "%s: roads are %.1f to %.1f m high, but the ground is flat at %.1f m, so pedestrians leave their surface",
-            where, tops_m.min(), tops_m.max(), header.ground_z_m,
-        )  # fmt: skip
-    points_m = [world_pose((*point, 0.0, 0.0, 0.0))[0][:2] for point in answers.road_points_m]
-    low_m, high_m = box_map.mins[:, :2], box_map.maxs[:, :2]
-    gaps_m = [np.maximum(low_m - point, point - high_m).max(axis=1).min() for point in points_m]
-    if num := sum(gap > ALONG_M for gap in gaps_m):
-        log.warning(
-            "%s: %d of %d points on roads have no object within %.0f m; CARLA loads a large map only near the "
-            "spectator",
-            where, num, len(points_m), ALONG_M,
-        )  # fmt: skip

@@ -344,28 +344,15 @@ def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | 
     """Raise NoPathError if no cell is walkable."""
     if counts["cells_walkable"]:
         return
-    if not counts["cells_free"]:
-        raise NoPathError(
-            "the map has no walkable cell",
-            where=where,
-            got=f"{counts['cells_occupied']} of {counts['cells']} cells occupied",
-            expected="free ground between the boxes",
-            fix="lower pedestrians.safety_radius_m, or give ground boxes a type such as Roads or Terrain",
-        )
-    if counts["cells_in_roi"] is None:
-        raise NoPathError(
-            "no free cell lies on the kind of ground that pedestrians.ground requires",
-            where=where,
-            got=f"{counts['cells_free']} free cells, all on other ground",
-            expected="at least one free cell on this kind of ground",
-            fix="set pedestrians.ground to `surfaces` or `anywhere`",
-        )
+    in_region = "" if counts["cells_in_roi"] is None else f", {counts['cells_in_roi']} in the region of interest"
     raise NoPathError(
-        "the region of interest has no walkable cell",
-        where=roi_where,
-        got=f"0 free cells among the {counts['cells_in_roi']} map cells in the region",
-        expected="a polygon in world metres of this map, over free ground",
-        fix="draw the region over free ground of this map",
+        "the map has no walkable cell",
+        where=roi_where if in_region else where,
+        got=f"of {counts['cells']} cells {counts['cells_free']} away from obstacles{in_region}, and none of these on "
+        "the ground of pedestrians.ground",
+        expected="free ground between the boxes, and a region in world metres of this map",
+        fix="lower pedestrians.safety_radius_m, give ground boxes a type such as Roads or Terrain, set "
+        "pedestrians.ground to `anywhere`, or draw the region over free ground",
     )
 
 
