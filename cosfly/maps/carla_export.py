@@ -1,7 +1,7 @@
 """The town of a running CARLA server: `get_environment_objects` of every label, as boxes (sec:step1).
 
-Known defects of such exports are counted and reported: labels without objects, repeated objects and ids, boxes without
-a size, one huge box around all of the terrain or the vegetation, and roads without objects along them.
+Known defects of such exports are counted: labels without objects, repeated objects and ids, boxes without a size, and
+one huge box around all of the terrain or the vegetation.
 """
 
 from __future__ import annotations
