@@ -165,7 +165,6 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "pedestrians": ["pedestrians --map {simple} --out {out} {tiny}"],
     "plan": ["plan --map {simple} --paths {walks} --out {out} {tiny}"],
     "plan compare": ["plan compare {simple} {walks} --out {out} {tiny} --planner foresight --planner track_astar"],
-    "plan benchmark": ["plan benchmark {simple} {walks} --out {out} {tiny} --planner theta_star --planner track_astar"],
     "render": [  # so narrow a view that the target is made out, and its picture written
         "render {three} --out {out} --set render.width_px=64 --set render.height_px=36 --set render.fovs_deg=[12]"
     ],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from typer import Argument, Option
@@ -19,7 +19,6 @@ options.add_group("roi", "Draw the region of interest for pedestrians.")
 
 Paths = Annotated[Path, Option(help="Pedestrian trajectories: path.json.")]
 PathsArgument = Annotated[Path, Argument(metavar="PATHS", help="Pedestrian trajectories: path.json.")]
-Planners = Annotated[list[str] | None, Option("--planner", show_default="all", help="Planner to compare; repeat it.")]
 SOURCE = SettingOption("maps.source", "synthetic, simworld, cityjson, boxes, carla or unrealcv.")
 ROI = SettingOption("roi", "Region of interest: roi_polygon.json.", Path)
 BACKEND = SettingOption("render.backend", "Renderer: gl, pyrender, carla or unrealcv.")
@@ -110,47 +109,28 @@ def plan(job: Job, map_: options.Map, paths: Paths, out: options.Out) -> None:
 
 @command("cosfly plan compare step2_simplified.json path.json --out compare", "plan", STAGE)
 def compare(
-    job: Job, map_: options.MapArgument, paths: PathsArgument, out: options.Out, planner: Planners = None
+    job: Job,
+    map_: options.MapArgument,
+    paths: PathsArgument,
+    out: options.Out,
+    planner: Annotated[
+        list[str] | None,
+        Option(show_default="foresight, track_astar, muco", help="Planner to compare; repeat it, or all."),
+    ] = None,
 ) -> None:
-    """Compare planners on the same pedestrians, against the first: tables, compare.json, trajectories, pictures.
+    """Compare planners on the same pedestrians, against the first: tables, compare.json, trajectories, a picture.
 
     TA*+Smooth is the paper's search with our smoothing, MuCO the paper's objective with our step."""
     from cosfly.planners import compare
-
-    product = job.call("cosfly.planners.compare", _comparison(job, compare.CompareConfig, planner), map_, paths, out)
-    for table in compare.text_tables(product):
-        options.print_table(table.columns, table.rows, table.title)
-    typer.echo(product)
-
-
-def _comparison(job: Job, model: Any, planners: list[str] | None) -> Any:
-    """Return the settings of a comparison of planners."""
+    from cosfly.planners.contract import ALL_PLANNERS
     from cosfly.runtime.config import build
 
-    return build(model, job.cfg.plan.model_dump() | ({"planners": planners} if planners else {}), "--planner")
-
-
-@command("cosfly plan benchmark step2_simplified.json path.json --out benchmark", "plan", STAGE)
-def benchmark(
-    job: Job, map_: options.MapArgument, paths: PathsArgument, out: options.Out, planner: Planners = None
-) -> None:
-    """Compare the paper's 14 planners and ours: tables with intervals, benchmark.json, figures.
-
-    TA*+Smooth is the paper's search with our smoothing, MuCO the paper's objective with our step."""
-    from cosfly.planners import benchmark
-    from cosfly.planners.contract import title_of
-    from cosfly.runtime.console import console
-    from cosfly.runtime.json_io import read_object
-
-    cfg = _comparison(job, benchmark.BenchmarkConfig, planner)
-    product = job.call("cosfly.planners.benchmark", cfg, map_, paths, out)
-    report = read_object(product, what=benchmark.FORMAT.what)
-    table = next(benchmark.text_tables(report))
-    head, *rows = [[row[k] for k in (0, 1, 5, 6, 7)] for row in (table.columns, *table.rows)]  # fits eighty columns
-    options.print_table(head, rows, table.title)
-    for name, note in report["notes"].items():
-        console.print(f"{title_of(name)}: {note}")
-    console.print(f"all tables: {out / 'benchmark.md'}")
+    planners = tuple(ALL_PLANNERS) if planner == ["all"] else planner
+    settings = job.cfg.plan.model_dump() | ({"planners": planners} if planners else {})
+    cfg = build(compare.CompareConfig, settings, "--planner")
+    product = job.call("cosfly.planners.compare", cfg, map_, paths, out)
+    for table in compare.text_tables(product):
+        options.print_table(table.columns, table.rows, table.title)
     typer.echo(product)
 
 

@@ -22,7 +22,7 @@ OPTIONAL_PACKAGES = {  # name: the purpose, and the packages to install
     "datasets": ("opening the release as a user would", "datasets"),
     "vllm": ("a teacher in this process", "-e '.[vllm]'"),
     "pyrender": ("the second renderer", "-e '.[pyrender]'"),
-    "ompl": ("the sampling planners of plan benchmark", "-e '.[ompl]'"),
+    "ompl": ("the sampling planners of plan compare", "-e '.[ompl]'"),
     "carla": ("CARLA's maps and pictures", "-e '.[carla]'"),
     "unrealcv": ("UnrealCV's maps and pictures", "-e '.[unrealcv]'; then --no-deps unrealcv"),
 }

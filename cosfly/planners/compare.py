@@ -3,23 +3,26 @@
 The paper's axes, as its table's figures define them: visibility is the mean; path efficiency is the shortest mean
 length of a planner without collisions over the planner's own; smoothness is 1 / (1 + jerk RMS); safety is (1 -
 collision fraction) * clamp(least clearance / 5 m); each from the planner's means over all pedestrian trajectories.
-"Blocked" is the share of rays that are not free. The other planners are compared with the first one. Only pedestrian
-trajectories that all planners follow are compared; the others are listed with the planner that failed.
+"Blocked" is the share of rays that are not free. The first planner is compared with each of the others.
+
+Where a planner finds no trajectory, its visibility and clearance count as 0 and all positions as collisions. Lengths
+and dynamics are means over the trajectories found; a planner that finds none gets the worst value.
+
+The paper prints the 14-way score (tab:appendix_h_extended_ranking) without its weights. Its rows determine them: with
+each criterion normalised from the worst planner, 0, to the best, 1, all fourteen scores are 0.35 visibility + 0.30
+collision + 0.35 clearance within 0.0001; path length, acceleration and jerk have no weight.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
-from cosfly.formats.boxes import BoxMap
-from cosfly.formats.episodes import Figure
-from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.formats.traces import DroneTrace, write_traces
 from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, PlanConfig, known_planner, planner_notes, title_of
 from cosfly.planners.overview import draw_compared
@@ -28,37 +31,52 @@ from cosfly.runtime.config import Distinct
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, read_object, write_json
-from cosfly.runtime.pool import ItemOutcomes, Watch, run_items
-from cosfly.runtime.run_dir import Dropped, Failed, Resume, StageFolder, read_manifest, result_of
-from cosfly.runtime.seeding import rng_for
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Resume, StageFolder, read_manifest, result_of
 from cosfly.runtime.worker import Item, Outcome, Work
 from cosfly.viz.tables import TextTable, cells
 
-FORMAT = FileFormat("cosfly.plan_compare", "2.2")
+FORMAT = FileFormat("cosfly.plan_compare", "3.0")
 CLEARANCE_SCALE_M = 5.0  # a clearance of this or more is full safety
 
-# Figures of one trajectory, in the order of the tables: name, title, digits.
-FIGURES = (
-    ("five_ray_mean", "average visibility", 3),
-    ("blocked_fraction", "blocked visibility fraction", 3),
-    ("length_m", "path length (m)", 1),
-    ("duration_s", "flight time (s)", 1),
-    ("target_distance_mean_m", "target distance (m)", 1),
-    ("altitude_mean_m", "altitude (m)", 1),
-    ("accel_rms_mps2", "acceleration RMS (m/s2)", 3),
-    ("jerk_rms_mps3", "jerk RMS (m/s3)", 3),
-    ("smoothness_score", "smoothness score S", 3),
-    ("collision_fraction", "collision fraction", 3),
-    ("clearance_min_m", "min signed clearance (m)", 2),
+FigureColumn = tuple[str, str, int]  # a figure of one trajectory: name, title, digits
+SIGHT_AND_SAFETY = (
+    ("five_ray_mean", "visibility", 3),
+    ("blocked_fraction", "blocked", 3),
+    ("collision_fraction", "collision", 3),
+    ("clearance_min_m", "clearance, m", 2),
 )
+FLIGHT = (
+    ("length_m", "length, m", 1),
+    ("duration_s", "time, s", 1),
+    ("target_distance_mean_m", "distance to target, m", 1),
+    ("altitude_mean_m", "altitude, m", 1),
+    ("accel_rms_mps2", "acceleration RMS, m/s2", 3),
+    ("jerk_rms_mps3", "jerk RMS, m/s3", 3),
+    ("smoothness_score", "smoothness score S", 3),
+)
+FIGURES = (*SIGHT_AND_SAFETY, *FLIGHT)
 NAMES = [name for name, _, _ in FIGURES]
 NO_TRAJECTORY = {"five_ray_mean": 0.0, "blocked_fraction": 1.0, "collision_fraction": 1.0, "clearance_min_m": 0.0}
+PAPER_DELTAS = {"five_ray_mean", "blocked_fraction", "clearance_min_m", "length_m", "accel_rms_mps2", "jerk_rms_mps3"}
 AXES = ("visibility", "path_efficiency", "smoothness", "safety")
 AXES_AND_MEAN = (*AXES, "mean")
-NUM_RESAMPLES, INTERVAL_PERCENT = 1000, (2.5, 97.5)  # of pedestrian trajectories, for intervals (Efron 1979)
+GROUPS = {
+    "our own": ("foresight",),
+    "target-aware": ("track_astar", "muco"),
+    "A* family": ("astar", "weighted_astar", "theta_star", "visibility_astar"),
+    "sampling, spline": ("rrt_star", "prm", "bspline_prm"),
+    "gradient, optimization": ("elastic_band", "minimum_jerk", "potential_field", "chomp", "trajopt"),
+}
+GROUP_OF = {planner: group for group, members in GROUPS.items() for planner in members}
+# Criteria of the weighted score: figure, whether more is better, weight (the paper's, see above).
+CRITERIA = {
+    "visibility": ("five_ray_mean", True, 0.35),
+    "collision": ("collision_fraction", False, 0.30),
+    "clearance": ("clearance_min_m", True, 0.35),
+}
 
 Means = dict[str, dict[str, float]]  # planner -> mean figures or scores
-FiniteMeans = dict[str, dict[str, float | None]]
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
@@ -72,13 +90,12 @@ def trajectory_figures(trace: DroneTrace) -> dict[str, float]:
     return {name: float(figures[name]) for name in NAMES}
 
 
-def mean_figures(tables: dict[str, np.ndarray], sample: np.ndarray | slice = slice(None)) -> Means:
-    """Average tables (n, figures) over sampled rows; NaN is ignored, and the mean of a column of NaN is infinite."""
+def mean_figures(tables: dict[str, np.ndarray]) -> Means:
+    """Average the rows of tables (n, figures); NaN is ignored, and the mean of a column of NaN is infinite."""
     mean_rows = {}
     for planner, table in tables.items():
-        rows = table[sample]
-        counts = (~np.isnan(rows)).sum(axis=0)
-        means = np.where(counts > 0, np.nansum(rows, axis=0) / np.maximum(counts, 1), np.inf)
+        counts = (~np.isnan(table)).sum(axis=0)
+        means = np.where(counts > 0, np.nansum(table, axis=0) / np.maximum(counts, 1), np.inf)
         mean_rows[planner] = dict(zip(NAMES, means.tolist(), strict=True))
     return mean_rows
 
@@ -104,19 +121,6 @@ def axis_scores(means: Means) -> Means:
     return scores
 
 
-def drawn_scores(tables: dict[str, np.ndarray], rng: np.random.Generator) -> list[Means]:
-    """Return the axis scores of all rows of tables (n, figures), then those of rows drawn with replacement."""
-    num = len(next(iter(tables.values())))
-    samples = [np.arange(num), *rng.integers(num, size=(NUM_RESAMPLES, num))]
-    return [axis_scores(mean_figures(tables, sample)) for sample in samples]
-
-
-def interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
-    """Return the 95 % interval of drawn values."""
-    low, high = np.percentile(np.nan_to_num(np.asarray(values, dtype=np.float64)), INTERVAL_PERCENT)
-    return round(float(low), 4), round(float(high), 4)
-
-
 def deltas(first: dict[str, float], second: dict[str, float]) -> dict[str, dict[str, float | None]]:
     """Return difference and relative difference in percent for each figure; None where the second's is 0."""
     table: dict[str, dict[str, float | None]] = {}
@@ -139,14 +143,14 @@ def win_rates(pairs: Sequence[tuple[dict[str, float], dict[str, float]]]) -> dic
     return {name: {"count": sum(w), "of": len(w), "rate": round(sum(w) / len(w), 4)} for name, w in wins.items()}
 
 
-def summarize(planned: dict[str, PlannedItem], planners: Sequence[str], rng: np.random.Generator) -> dict[str, Any]:
+def summarize(planned: dict[str, PlannedItem], planners: Sequence[str]) -> dict[str, Any]:
     """Compare planners on the same pedestrian trajectories.
 
     Args:
-        planned: id of a pedestrian trajectory -> the planners' trajectories. rng: draws scenarios for the intervals.
+        planned: id of a pedestrian trajectory -> the planners' trajectories.
     Returns:
-        The tables of the product. `deltas`, `axis_differences` and `win_rates` are by the other planner: the first
-        planner's figures minus its own, and the first planner's wins, where both found trajectories.
+        The tables of the product. `deltas` and `win_rates` are by the other planner: the first planner's figures minus
+        its own, and the first planner's wins, where both found trajectories.
     """
     first, *others = planners
     found = {path_id: item.read_traces(path_id) for path_id, item in planned.items()}
@@ -154,29 +158,51 @@ def summarize(planned: dict[str, PlannedItem], planners: Sequence[str], rng: np.
         {"id": path_id, **{name: trajectory_figures(traces[name]) if name in traces else None for name in planners}}
         for path_id, traces in found.items()
     ]
-    tables = {name: np.array([_table_row(scenario[name]) for scenario in scenarios]) for name in planners}
-    means = mean_figures(tables)
-    measured, *resampled = drawn_scores(tables, rng)
-
-    def difference(other: str, axis: str) -> dict[str, float]:
-        low, high = interval([scores[first][axis] - scores[other][axis] for scores in resampled])
-        return {"difference": round(measured[first][axis] - measured[other][axis], 4), "low": low, "high": high}
-
+    means = mean_figures({name: np.array([_table_row(row[name]) for row in scenarios]) for name in planners})
     pairs = {other: [(row[first], row[other]) for row in scenarios if row[first] and row[other]] for other in others}
     return {
         "scenarios": scenarios,
         "infeasible": {path_id: item.errors for path_id, item in planned.items() if item.errors},
         "means": {name: finite(row) for name, row in means.items()},
         "shortest_mean_m": round(shortest_mean_m(means), 4),
-        "axes": measured,
-        "intervals": {
-            name: {axis: interval([scores[name][axis] for scores in resampled]) for axis in AXES_AND_MEAN}
-            for name in planners
-        },
+        "axes": axis_scores(means),
+        "ranking": ranking(means),
+        "groups": _groups(means),
         "deltas": {other: deltas(means[first], means[other]) for other in others if pairs[other]},
-        "axis_differences": {other: {axis: difference(other, axis) for axis in AXES_AND_MEAN} for other in others},
         "win_rates": {other: win_rates(pairs[other]) for other in others if pairs[other]},
     }
+
+
+def ranking(means: Means) -> dict[str, dict[str, Any]]:
+    """Return rank, weighted score and criteria from 0, the worst, to 1, the best; 1 where there is no difference."""
+    columns = []
+    for figure, more_is_better, _ in CRITERIA.values():
+        values = np.array([row[figure] for row in means.values()])
+        span = np.ptp(values)
+        share = (values - values.min()) / span if span > 0 else np.full(len(values), float(more_is_better))
+        columns.append(share if more_is_better else 1.0 - share)
+    normalized = np.stack(columns, axis=1)
+    planners = list(means)
+    scores = (normalized @ [weight for *_, weight in CRITERIA.values()]).round(4)
+    return {
+        planners[k]: {
+            "rank": rank,
+            "score": float(scores[k]),
+            "normalized": dict(zip(CRITERIA, np.round(normalized[k], 4).tolist(), strict=True)),
+        }
+        for rank, k in enumerate(np.argsort(-scores, kind="stable").tolist(), 1)
+    }
+
+
+def _groups(means: Means) -> dict[str, dict[str, Any]]:
+    """Return the number of planners of each group, and the means of their mean figures."""
+    groups = {}
+    for group, members in GROUPS.items():
+        rows = [list(means[planner].values()) for planner in members if planner in means]
+        if rows:
+            figures = dict(zip(NAMES, np.mean(rows, axis=0), strict=True))
+            groups[group] = {"num_planners": len(rows), "figures": finite(figures)}
+    return groups
 
 
 def _table_row(figures: dict[str, float] | None) -> list[float]:
@@ -219,11 +245,8 @@ class PlannedItem(BaseModel):
         return {name: DroneTrace.from_json(t, f"items.jsonl: {path_id}: {name}") for name, t in self.traces.items()}
 
 
-def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int, keeps_all: bool) -> Work:
-    """Load the map once; return the function that plans for one pedestrian trajectory with each planner.
-
-    keeps_all: Keep an item if only some planners failed.
-    """
+def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int) -> Work:
+    """Load the map once; return the function that plans for one pedestrian trajectory with each planner."""
     obstacles, screens = load_obstacles(simplified_map)
     settings = {name: cfg.model_copy(update={"planner": name}) for name in cfg.planners}
     for planner_cfg in settings.values():
@@ -244,30 +267,9 @@ def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int, keeps_all: 
             planned.times_ms[name] = round(1000.0 * (time.perf_counter() - begin_s), 2)
         if not planned.traces:
             raise errors[0]
-        dropped = f"no_{next(iter(planned.errors))}_trajectory" if errors and not keeps_all else None
-        return Outcome(planned.model_dump(), dropped)
+        return Outcome(planned.model_dump())
 
     return work
-
-
-def plan_all(
-    stage: StageFolder, cfg: CompareConfig, simplified_map: Path, paths: Path, seed: int, *, most: int | None = None,
-    keeps_all: bool = False, **pool: Any,
-) -> tuple[BoxMap, list[PedestrianTrajectory], ItemOutcomes, dict[str, PlannedItem], dict[str, Any]]:  # fmt: skip
-    """Plan for each pedestrian trajectory, or the first `most`, with each planner.
-
-    Returns:
-        Map, pedestrian trajectories, work items, the kept ones by id, and the head of the product.
-    """
-    box_map, pedestrians = read_inputs(simplified_map, paths)
-    items = make_items(pedestrians[:most], cfg, seed)
-    done = run_items(stage, items, make_worker, (cfg, simplified_map, seed, keeps_all), **pool)
-    if not done.tally.kept:
-        followers = "at least one planner" if keeps_all else "every planner"
-        raise stage.nothing_kept(done.tally, expected=f"a pedestrian trajectory that {followers} can follow")
-    planned = {record.id: result_of(record, PlannedItem) for record in done.kept}
-    header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.all_values()}
-    return box_map, pedestrians, done, planned, header
 
 
 def run(
@@ -276,26 +278,27 @@ def run(
 ) -> Path:  # fmt: skip
     """Read a simplified map and `path.json`; write `compare.json`, each planner's traces and a picture.
 
-    A pedestrian trajectory that a planner cannot follow is dropped with that planner's name; one that no planner can
-    follow is a failure. Return the path of `compare.json`.
+    A pedestrian trajectory that no planner can follow, such as one through a house, is a failure and is not compared.
+    Planning times are written to `items.jsonl` and the manifest, the only files that differ between equal runs. Return
+    the path of `compare.json`.
     """
     product = out / "compare.json"
     inputs = {"map": simplified_map, "paths": paths}
     stage = StageFolder.open(out, "plan_compare", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return product
-    box_map, pedestrians, done, planned, header = plan_all(
-        stage, cfg, simplified_map, paths, seed, workers=workers, watch=watch
-    )
-    summary = {
-        "planners": {name: ALL_PLANNERS[name] for name in cfg.planners},
-        "notes": planner_notes(cfg.planners, cfg),
-        **summarize(planned, cfg.planners, rng_for(seed, "plan_compare", "intervals")),
-        "skipped": _skipped(done),
-    }
-    write_json(product, {**FORMAT.header, **header, **summary})
+    box_map, pedestrians = read_inputs(simplified_map, paths)
+    items = make_items(pedestrians, cfg, seed)
+    done = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers, watch=watch)
+    if not done.tally.kept:
+        raise stage.nothing_kept(done.tally, expected="a pedestrian trajectory that at least one planner can follow")
+    planned = {record.id: result_of(record, PlannedItem) for record in done.kept}
+    header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.all_values()}
+    modules = {name: ALL_PLANNERS[name] for name in cfg.planners}
+    facts = {"planners": modules, "notes": planner_notes(cfg.planners, cfg)}
+    write_json(product, {**FORMAT.header, **header, **facts, **summarize(planned, cfg.planners)})
     found = [item.read_traces(path_id) for path_id, item in planned.items()]
-    traces = {name: [path_traces[name] for path_traces in found] for name in cfg.planners}
+    traces = {name: [path_traces[name] for path_traces in found if name in path_traces] for name in cfg.planners}
     outputs = [product, *(out / f"drone_trace_{name}.json" for name in traces), out / "compare_overlay.png"]
     for path, (name, planner_traces) in zip(outputs[1:], traces.items(), strict=False):
         write_traces(path, planner_traces, {**header, "planner": name})
@@ -303,18 +306,6 @@ def run(
     write_bytes(outputs[-1], draw_compared(box_map, compared, traces))
     stage.finish(outputs, done.tally, timings=timings(planned.values(), cfg.planners))
     return product
-
-
-def _skipped(done: ItemOutcomes) -> Iterable[dict[str, str]]:
-    """Return the pedestrian trajectories that are not compared, with the planners that failed and their reasons."""
-    rows = []
-    for record in done.records:
-        if isinstance(record, Failed):
-            rows.append({"id": record.id, "planner": "all", "message": record.message})
-        elif isinstance(record, Dropped):
-            errors = result_of(record, PlannedItem).errors
-            rows += [{"id": record.id, "planner": planner, "message": message} for planner, message in errors.items()]
-    return rows
 
 
 def timings(items: Collection[PlannedItem], planners: Sequence[str]) -> Means:
@@ -328,37 +319,71 @@ def timings(items: Collection[PlannedItem], planners: Sequence[str]) -> Means:
     return table
 
 
-def text_tables(product: Path) -> list[TextTable]:
-    """Read `compare.json` and its manifest as text tables: figures, axes, and the first planner's wins."""
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+def text_tables(product: Path) -> Iterator[TextTable]:
+    """Read `compare.json` and its manifest as text tables: figures, the paper's axes, score and groups, and deltas."""
     comparison = read_object(product, what="comparison")
+    means, scenarios = comparison["means"], comparison["scenarios"]
     times = read_manifest(product.parent).facts["timings"]
-    first, *others = planners = list(comparison["means"])
-    titles = [title_of(planner) for planner in planners]
-    minus = [f"minus {title_of(other)}" for other in others]
-    figures = []
-    for name, words, digits in FIGURES:
-        row = [words, *cells((comparison["means"][planner][name] for planner in planners), digits)]
-        for other in others:
-            change = comparison["deltas"][other][name]
-            relative = change["relative_percent"]
-            row += [f"{change['delta']:+.{digits}f}", "n/a" if relative is None else f"{relative:+.1f}"]
-        figures.append(row)
-    means_ms = cells((times[planner]["mean_ms"] for planner in planners), 1)
-    figures.append(["planning time (ms)", *means_ms, *[""] * 2 * len(others)])
-    axes = []
-    for name in AXES_AND_MEAN:
-        found = [comparison["axis_differences"][other][name] for other in others]
-        differences = [Figure(value=one["difference"], low=one["low"], high=one["high"], count=0) for one in found]
-        scores = cells(comparison["axes"][p][name] for p in planners)
-        axes.append([name.replace("_", " "), *scores, *(one.shown("+.3f") for one in differences)])
+    first = title_of(next(iter(means)))
+
+    columns, rows = ["found", "free of collisions", *_titles(SIGHT_AND_SAFETY)], {}
+    for planner, figures in means.items():
+        found = [scenario[planner]["collision_fraction"] for scenario in scenarios if scenario[planner]]
+        counts = [f"{count} of {len(scenarios)}" for count in (len(found), found.count(0.0))]
+        rows[title_of(planner)] = [*counts, *_figure_cells(figures, SIGHT_AND_SAFETY)]
+    yield _table("Sight and safety; a missing trajectory counts as a collision without visibility", columns, rows)
+
+    rows = {
+        title_of(planner): [*_figure_cells(figures, FLIGHT), *cells([times[planner]["mean_ms"]], 1)]
+        for planner, figures in means.items()
+    }
+    yield _table("Flight; means over the trajectories found", [*_titles(FLIGHT), "planning, ms"], rows)
+
+    by_mean = sorted(comparison["axes"].items(), key=lambda entry: -entry[1]["mean"])
+    rows = {title_of(planner): cells(scores[axis] for axis in AXES_AND_MEAN) for planner, scores in by_mean}
+    title = f"Axis scores; efficiency relative to the shortest mean, {comparison['shortest_mean_m']:.2f} m"
+    yield _table(title, [axis.replace("_", " ") for axis in AXES_AND_MEAN], rows)
+
+    rows = {
+        f"{row['rank']} {title_of(planner)}": [
+            GROUP_OF.get(planner, "-"), *cells([row["score"], *row["normalized"].values()])
+        ]
+        for planner, row in comparison["ranking"].items()
+    }  # fmt: skip
+    weights = ", ".join(f"{weight:g} {name}" for name, (*_, weight) in CRITERIA.items())
+    title = f"Weighted score: {weights}; each is scaled from 0 (worst planner) to 1 (best planner)"
+    yield _table(title, ["group", "score", *CRITERIA], rows)
+
+    shown = [*SIGHT_AND_SAFETY, FLIGHT[0]]
+    rows = {
+        group: [str(row["num_planners"]), *_figure_cells(row["figures"], shown)]
+        for group, row in comparison["groups"].items()
+    }
+    yield _table("Means of groups", ["planners", *_titles(shown)], rows)
+
+    shown = [column for column in FIGURES if column[0] in PAPER_DELTAS]
+    rows = {
+        title_of(other): cells((changes[name]["relative_percent"] for name, *_ in shown), 1)
+        for other, changes in comparison["deltas"].items()
+    }
+    yield _table(f"{first} minus another planner, %", _titles(shown), rows)
+
     rates = comparison["win_rates"]
-    wins = [
-        [name.replace("_", " "), *(f"{rates[o][name]['count']} of {rates[o][name]['of']}" for o in others)]
-        for name in rates[others[0]]
-    ]
-    columns = ["figure", *titles, *(column for title in minus for column in (title, "%"))]
-    return [
-        TextTable("Means over the pedestrian trajectories that all planners follow", columns, figures),
-        TextTable("Axis scores, higher is better; differences with 95 % intervals", ["axis", *titles, *minus], axes),
-        TextTable(f"{title_of(first)} better", ["criterion", *(f"than {title_of(o)}" for o in others)], wins),
-    ]
+    rows = {title_of(other): [f"{w['count']} of {w['of']}" for w in wins.values()] for other, wins in rates.items()}
+    names = [name.replace("_", " ") for name in next(iter(rates.values()), ())]
+    yield _table(f"{first} better than another planner", names, rows)
+
+
+def _table(title: str, columns: list[str], rows: dict[str, list[str]]) -> TextTable:
+    return TextTable(title, ["planner", *columns], [[name, *row] for name, row in rows.items()])
+
+
+def _titles(figures: Sequence[FigureColumn]) -> list[str]:
+    return [title for _, title, _ in figures]
+
+
+def _figure_cells(row: dict[str, float | None], figures: Sequence[FigureColumn]) -> list[str]:
+    return [text for name, _, digits in figures for text in cells([row[name]], digits)]

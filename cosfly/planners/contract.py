@@ -36,7 +36,7 @@ PLANNERS = {
     "track_astar": "cosfly.planners.track_astar:plan",
     "muco": "cosfly.planners.muco.muco:plan",
 }
-# Generic planners without a visibility term, for `plan benchmark` (app:three_axis_eval).
+# Generic planners without a visibility term, for `plan compare --planner all` (app:three_axis_eval).
 _REFERENCE_MODULES = {
     "rrt_star": "sampling", "prm": "sampling", "bspline_prm": "sampling", "elastic_band": "optimization",
     "minimum_jerk": "optimization", "astar": "graph_search", "weighted_astar": "graph_search",

@@ -23,9 +23,10 @@ FRAMES_BETWEEN_SIGHTS = 20  # one line of sight every 10 s
 # Colors of planners: the paper's blue and orange, then others that also differ in brightness.
 PALETTE = (
     (30, 100, 210), (235, 120, 20), (20, 150, 90), (150, 60, 170), (120, 90, 60), (20, 170, 190), (200, 40, 60),
-    (110, 110, 110),
+    (110, 110, 110), (90, 200, 40), (230, 110, 190), (100, 0, 90), (0, 90, 60), (190, 170, 0), (110, 150, 250),
+    (250, 160, 130),
 )  # fmt: skip
-LEGEND_PX = 160  # width of one planner's entry
+LEGEND_PX = 24  # height of one planner's entry
 
 
 def color_of(planner: str) -> tuple[int, int, int]:
@@ -99,9 +100,8 @@ def draw_compared(
 
 
 def _draw_legend(picture: np.ndarray, planners: list[str]) -> None:
-    """Draw a line and the title of each planner at the right end of the caption."""
-    x = float(picture.shape[1] - LEGEND_PX * len(planners))
-    y = 25.0
-    for planner in planners:
-        draw_line(picture, np.array([[x, y - 5], [x + 34, y - 5]]), color_of(planner), 3)
-        x = draw_text(picture, title_of(planner), x + 42, y) + 18
+    """Draw a line and the title of each planner below the caption, at the left."""
+    for place, planner in enumerate(planners, 1):
+        y = 36.0 + LEGEND_PX * place
+        draw_line(picture, np.array([[10.0, y - 5], [44.0, y - 5]]), color_of(planner), 3, halo=5)
+        draw_text(picture, title_of(planner), 52.0, y, halo=HALO)

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.planners.compare import NUM_RESAMPLES, interval
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import load_obstacles, make_items, make_scenario, plan_trajectory, read_inputs, warm_up
 from cosfly.runtime.errors import NoPathError
@@ -27,6 +26,7 @@ from cosfly.runtime.worker import Item, Outcome, Work
 FORMAT = FileFormat("cosfly.beam_study", "1.0")
 PAPER_BEAM = 2048
 BEAMS = (64, 256, 512, 1024, PAPER_BEAM, 4096)
+NUM_RESAMPLES, INTERVAL_PERCENT = 1000, (2.5, 97.5)  # of pedestrian trajectories, for intervals (Efron 1979)
 FIGURES = ("five_ray_mean", "length_m", "jerk_rms_mps3", "clearance_min_m")
 
 
@@ -121,9 +121,9 @@ def summarize(planned: dict[int, list[Planned]], rng: np.random.Generator) -> di
         figures = {}
         for k, name in enumerate(FIGURES if len(table) else ()):
             differences = table[:, 0, k] - table[:, 1, k]
-            low, high = interval(differences[draws].mean(axis=1))
-            mean, difference = round(float(table[:, 0, k].mean()), 4), round(float(differences.mean()), 4)
-            figures[name] = {"mean": mean, "difference": difference, "low": low, "high": high}
+            low, high = np.percentile(differences[draws].mean(axis=1), INTERVAL_PERCENT)
+            row = {"mean": table[:, 0, k].mean(), "difference": differences.mean(), "low": low, "high": high}
+            figures[name] = {what: round(float(value), 4) for what, value in row.items()}
         kept = sum(outcome.reason is None for outcome in outcomes)
         rows[beam] = {"walks": len(outcomes), "kept": kept, "figures": figures}
     return rows

@@ -28,7 +28,8 @@ def sampled(task: Task, method: str, *, is_spline: bool = False) -> np.ndarray |
     try:
         from ompl import base, geometric, util
     except ImportError as error:
-        raise EnvironmentMissing("OMPL is not installed", got=str(error), fix='pip install -e ".[ompl]"') from None
+        fix = 'pip install -e ".[ompl]", or leave out the planners rrt_star, prm and bspline_prm'
+        raise EnvironmentMissing("OMPL is not installed", got=str(error), fix=fix) from None
     util.setLogLevel(util.LogLevel.LOG_NONE)
     util.RNG.setSeed(int(task.rng.integers(1, 2**31)))
     space_information = _space_information(base, task)
