@@ -159,7 +159,6 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "maps": ["maps --out {out} {tiny}"],
     "maps carla": ["maps --source carla --set maps.carla.port={carla} --out {out}"],
     "maps unrealcv": ["maps --source unrealcv --set maps.unrealcv.port={unrealcv} --out {out}"],
-    "maps roi-backdrop": ["maps roi-backdrop --map {maps} --out {out}/above.png --bounds -9 -9 9 9 --pixels-per-m 1"],
     "world": ["world 'a small village with a well' --out {out}"],
     "simplify": ["simplify --map {maps} --out {out} {tiny}"],
     "pedestrians": ["pedestrians --map {simple} --out {out} {tiny}"],

@@ -41,8 +41,8 @@ def map_file(tmp_path) -> Path:
 
 
 @contextlib.contextmanager
-def serving(map_file: Path, roi: Path, **more: object) -> Iterator[PageServer]:
-    server = open_editor(map_file, CFG, roi, 0, more.get("backdrop"))
+def serving(map_file: Path, roi: Path) -> Iterator[PageServer]:
+    server = open_editor(map_file, CFG, roi, 0)
     thread = threading.Thread(target=server.serve)
     thread.start()
     try:

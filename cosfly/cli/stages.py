@@ -13,7 +13,7 @@ from typer import Argument, Option
 from cosfly.cli import options
 from cosfly.cli.options import STAGE, WORKERS, Job, SettingOption, command, track_options
 
-for stage in ("maps", "plan", "inspect"):
+for stage in ("plan", "inspect"):
     options.add_group(stage)
 options.add_group("roi", "Draw the region of interest for pedestrians.")
 
@@ -59,22 +59,6 @@ def maps(job: Job, out: options.Out) -> None:
     job.run("cosfly.maps.stage", job.cfg.maps, out, follow_links=job.cfg.follow_links)
 
 
-@command("cosfly maps roi-backdrop --map boxes_3d.json --out above.png", "render", backend=BACKEND)
-def roi_backdrop(
-    job: Job,
-    map_: options.Map,
-    out: Annotated[Path, Option(help="PNG to write, with its world frame in a JSON file next to it.")],
-    bounds: Annotated[
-        tuple[float, float, float, float] | None,
-        Option(metavar="W S E N", show_default="the whole map", help="Area to draw, world metres."),
-    ] = None,
-    pixels_per_m: Annotated[float, Option(min=0.01, max=100, help="Scale, pixels per metre.")] = 4.0,
-) -> None:
-    """Draw the map from above with a renderer, for `roi edit --backdrop`."""
-    drawing = {"bounds_m": bounds, "pixels_per_m": pixels_per_m}
-    typer.echo(job.call("cosfly.render.backdrop", job.cfg.render, map_, out, **drawing))
-
-
 @command("cosfly simplify --map maps/boxes_3d.json --out simplify", "simplify", "town resume")
 def simplify(job: Job, map_: options.Map, out: options.Out) -> None:
     """Merge, crop and prune boxes_3d.json into step2_simplified.json (step 2)."""
@@ -92,11 +76,10 @@ def edit(
     job: Job,
     map_: options.MapArgument,
     roi: Annotated[Path, Option(help="Region to edit, if it exists, and to save.")] = Path("roi_polygon.json"),
-    backdrop: Annotated[Path | None, Option(help="PNG of `maps roi-backdrop`.")] = None,
     port: Annotated[int, Option(min=0, max=65535, help="Port on this machine; 0 takes a free one.")] = 0,
 ) -> None:
     """Edit the region of interest on a local page, over the planning grid; end with Ctrl-C."""
-    server = job.call("cosfly.pedestrians.roi_editor:open_editor", map_, job.cfg.pedestrians, roi, port, backdrop)
+    server = job.call("cosfly.pedestrians.roi_editor:open_editor", map_, job.cfg.pedestrians, roi, port)
     typer.echo(f"open {server.address}")
     server.serve()
 

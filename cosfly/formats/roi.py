@@ -1,24 +1,20 @@
-"""`roi_polygon.json`, where pedestrians may walk: the paper's form, and ours with holes; and the picture under it."""
+"""`roi_polygon.json`, where pedestrians may walk: the paper's form, and ours with holes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import shapely
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 from shapely.geometry.base import BaseGeometry
 
 from cosfly.formats.boxes import AXES, BoxMap
-from cosfly.formats.columns import LARGEST, numbers
+from cosfly.formats.columns import numbers
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import over_limit, read_bytes, write_bytes
-from cosfly.runtime.json_io import FileFormat, Record, parse_document, read_model, validated, write_json, write_model
-from cosfly.runtime.png import read_picture
+from cosfly.runtime.io import over_limit, read_bytes
+from cosfly.runtime.json_io import parse_document, validated, write_json
 
 WHAT = "region of interest"
-BACKDROP_FORMAT = FileFormat("cosfly.backdrop", "1.0", "world frame of a picture")
 MOST_VERTICES = 100_000  # of a region; to see that a spiky ring does not cross itself takes 8 s then
 
 
@@ -105,45 +101,3 @@ def parse_roi(data: bytes, path: Path) -> Roi:
             fix = "draw the ring again without crossings"
             raise InputError("a ring of the polygon crosses itself", where=where, got=reason, fix=fix)
     return roi
-
-
-# --- the backdrop: a picture of a map from above (PNG) with its world frame (JSON), on which a region is drawn -------
-
-
-class WorldFrame(Record):
-    """Position of a picture, north up: the world place of its top left corner, and the side of a pixel, m."""
-
-    west_m: float = Field(ge=-LARGEST, le=LARGEST)
-    north_m: float = Field(ge=-LARGEST, le=LARGEST)
-    metres_per_px: float = Field(gt=0, le=1000)
-
-
-@dataclass(frozen=True)
-class Backdrop:
-    """picture: (height, width, 3) uint8 RGB."""
-
-    picture: np.ndarray
-    world: WorldFrame
-
-    @classmethod
-    def read(cls, path: Path) -> Backdrop:
-        """Read a picture and its world frame, the file of the same name that ends in `.json`."""
-        return cls(read_picture(path), read_model(path.with_suffix(".json"), WorldFrame, BACKDROP_FORMAT))
-
-    def frame(self) -> dict[str, float]:
-        """Return west, north, width and height, m."""
-        height, width = (side * self.world.metres_per_px for side in self.picture.shape[:2])
-        return {"west": self.world.west_m, "north": self.world.north_m, "width": width, "height": height}
-
-    def covers(self, box_map: BoxMap) -> bool:
-        """Return whether any of the map lies in the picture."""
-        (low, high), frame = box_map.bounds(), self.frame()
-        is_beside = frame["west"] > high[0] or frame["west"] + frame["width"] < low[0]
-        return not (is_beside or frame["north"] < low[1] or frame["north"] - frame["height"] > high[1])
-
-
-def write_backdrop(path: Path, png: bytes, world: WorldFrame) -> None:
-    """Write a picture and its frame, the frame first, so that no picture lacks one."""
-    path.unlink(missing_ok=True)  # which may lie elsewhere
-    write_model(path.with_suffix(".json"), world, BACKDROP_FORMAT)
-    write_bytes(path, png)

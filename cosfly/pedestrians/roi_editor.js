@@ -7,7 +7,7 @@ const COLORS = { outer: "#d69e2e", hole: "#e53e3e", other: "#2b6cb0", chosen: "#
 const MOST_STEPS = 300, MOST_DOTS = 4000, NEAR_PX = 9;
 const LABELS = {
   en: {
-    title: "region of interest", fit: "Whole map", backdrop: "backdrop", grid: "planning grid", above: "map from above", picture: "picture", outer: "New polygon", hole: "New hole",
+    title: "region of interest", fit: "Whole map", backdrop: "backdrop", grid: "planning grid", above: "map from above", outer: "New polygon", hole: "New hole",
     close: "Close polygon", undo: "Undo", redo: "Redo", remove: "Remove vertex", discard: "Remove polygon", vertex: "vertex", open: "Open file", save: "Save",
     mask: "Compare mask", south: "first row is south", polygon: "polygon", holeOf: "hole", open_ring: "open", points: "points",
     keys: "Click: vertex. Drag: move. Double click on an edge: new vertex. Wheel: zoom; right drag: pan. Keys: arrows move the vertex by a cell (Shift: ten) or pan; N, B next and previous vertex; " +
@@ -19,7 +19,7 @@ const LABELS = {
     not_saved: "close the open polygon first", drawing: "click to add vertices, then close the polygon", lost: "the server of the editor does not answer; start the editor again", no_picture: "cannot be read as a picture", large_file: "the file is too large",
   },
   zh: {
-    title: "感兴趣区域", fit: "全图", backdrop: "底图", grid: "规划栅格", above: "俯视图", picture: "图片", outer: "新多边形", hole: "新孔洞",
+    title: "感兴趣区域", fit: "全图", backdrop: "底图", grid: "规划栅格", above: "俯视图", outer: "新多边形", hole: "新孔洞",
     close: "闭合多边形", undo: "撤销", redo: "重做", remove: "删除顶点", discard: "删除多边形", vertex: "顶点", open: "打开文件", save: "保存",
     mask: "对比掩膜", south: "首行为南", polygon: "多边形", holeOf: "孔洞", open_ring: "未闭合", points: "个点",
     keys: "单击：加顶点；拖动：移动；双击边：插入顶点；滚轮：缩放；右键拖动：平移。按键：方向键移动顶点一格（Shift：十格）或平移；N、B 下一个/上一个顶点；空格：在十字处加顶点；+ - 缩放；Esc：取消选择。",
@@ -32,7 +32,7 @@ const LABELS = {
 };
 const state = { rings: [], ring: -1, vertex: -1, kind: "outer", cross: null, answer: data, mask: null, language: navigator.language.startsWith("zh") ? "zh" : "en", said: ["drawing", ""] };
 const steps = { list: [[]], at: 0 };
-const layers = { grid: null, cells: null, above: null, picture: null, mask: null };
+const layers = { grid: null, cells: null, above: null, mask: null };
 let values = null, marks = null;  // of each cell, north up: grey level of the grid; 0, in the region, walkable
 const say = (word) => LABELS[state.language][word] ?? word;
 
@@ -206,10 +206,9 @@ function compare() {
 // --- what is shown ---------------------------------------------------------------------------------------------------
 
 function paint() {
-  const backdrop = byId("backdrop").value, frame = data.picture;
+  const backdrop = byId("backdrop").value;
   if (layers.grid) map.picture(layers.grid, BOUNDS);
   if (backdrop === "above" && layers.above) map.picture(layers.above, BOUNDS, true);
-  if (backdrop === "picture" && layers.picture) map.picture(layers.picture, [frame.west, frame.north - frame.height, frame.west + frame.width, frame.north], true);
   if (layers.cells && state.rings.some((ring) => ring.closed)) map.picture(layers.cells, BOUNDS);
   if (layers.mask) map.picture(layers.mask, BOUNDS);
   const first = state.rings.findIndex((ring) => !ring.hole);
@@ -369,7 +368,7 @@ byId("backdrop").addEventListener("change", () => attempt(async () => {
 }));
 window.addEventListener("beforeunload", (event) => { if (steps.at > 0 && state.said[0] !== "saved") event.preventDefault(); });
 
-show("backdrop", ...["grid", "above", data.picture ? "picture" : null].filter(Boolean).map((name) => make("option", { value: name }, name)));
+show("backdrop", ...["grid", "above"].map((name) => make("option", { value: name }, name)));
 attempt(async () => {
   layers.grid = await createImageBitmap(new Blob([bytesOf(data.grid)]));
   values = pixelsOf(layers.grid, 0);

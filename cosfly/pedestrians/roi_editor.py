@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from cosfly.formats.boxes import AXES, BoxMap, check_ground, read_boxes
-from cosfly.formats.roi import Backdrop, Roi, parse_roi, write_roi
+from cosfly.formats.roi import Roi, parse_roi, write_roi
 from cosfly.geometry.grid import empty_grid
 from cosfly.pedestrians.walkable import PedestriansConfig, check_roi, walkable_ground
 from cosfly.runtime.errors import InputError
@@ -42,14 +42,13 @@ def _read_map(path: Path) -> BoxMap:
 class Editor:
     """What the page asks for: one map, and one file that it may write.
 
-    digest: of the file as it was read or written last; None where there was none. backdrop: a picture from above.
+    digest: of the file as it was read or written last; None where there was none.
     """
 
     box_map: BoxMap
     cfg: PedestriansConfig
     path: Path
     where: Path
-    backdrop: Backdrop | None = None
     digest: str | None = None
     lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -83,7 +82,7 @@ class Editor:
             "x_min": grid.x_min_m, "y_min": grid.y_min_m, "cell": grid.resolution_m, "size": grid.size,
             "grid": _encoded(levels), "levels": [OCCUPIED, MARGIN, UNUSED, FREE],
             "alphas": [IN_REGION[3], WALKABLE[3]], "walkable": (*WALKABLE[:3], WALKABLE[3] / 255),
-            "picture": self.backdrop and self.backdrop.frame(), **self.cells(None),
+            **self.cells(None),
         }  # fmt: skip
         style = read_text(folder / "roi_editor.css")
         script = scripts("tools.js", "canvas.js") + read_text(folder / "roi_editor.js")
@@ -135,8 +134,6 @@ class Editor:
             # A place is 0 in the middle of the first pixel.
             corner = grid.x_min_m + 0.5 / per_m, grid.y_min_m + size_m[1] - 0.5 / per_m
             return png_bytes(draw_map(self.box_map, TopView(*corner, per_m, (width, height))))
-        if name == "picture" and self.backdrop:
-            return png_bytes(self.backdrop.picture)
         answers: dict[str, Callable[[], dict[str, Any]]] = {
             "cells": lambda: self.cells(parse_roi(data, Path("the page")) if data else None),
             "open": lambda: self.region_of(data, Path("the file")),
@@ -156,24 +153,6 @@ def _encoded(picture: np.ndarray) -> str:
     return base64.b64encode(data.tobytes()).decode()
 
 
-def _area_text(x_min_m: float, x_max_m: float, y_min_m: float, y_max_m: float) -> str:
-    return f"x {x_min_m:.1f} to {x_max_m:.1f} m, y {y_min_m:.1f} to {y_max_m:.1f} m"
-
-
-def open_editor(map_: Path, cfg: PedestriansConfig, roi: Path, port: int, backdrop: Path | None) -> PageServer:
+def open_editor(map_: Path, cfg: PedestriansConfig, roi: Path, port: int) -> PageServer:
     """Read all that the page shows, and listen; `PageServer.serve` answers until it is interrupted."""
-    box_map = _read_map(map_)
-    picture = None if backdrop is None else Backdrop.read(backdrop)
-    if picture is not None and not picture.covers(box_map):
-        frame = picture.frame()
-        west_m, north_m = frame["west"], frame["north"]
-        shown = _area_text(west_m, west_m + frame["width"], north_m - frame["height"], north_m)
-        low_m, high_m = box_map.bounds()
-        raise InputError(
-            "the backdrop picture does not overlap the map",
-            where=backdrop,
-            got=f"a picture of {shown}",
-            expected=f"a picture that overlaps {_area_text(low_m[0], high_m[0], low_m[1], high_m[1])}",
-            fix="correct the JSON file next to the picture",
-        )
-    return PageServer(Editor(box_map, cfg, roi, map_, picture), port)
+    return PageServer(Editor(_read_map(map_), cfg, roi, map_), port)
