@@ -35,7 +35,6 @@ from cosfly.llm.student_chat import encoded_image
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run as render
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import read_checksums
 from cosfly.viz.gallery import four_panels
 from cosfly.viz.viewer import run
 from distill.inference.stage import EngineAnswers, InferConfig, Inputs
@@ -290,46 +289,30 @@ SETTINGS = {
 
 
 @pytest.fixture(scope="module")
-def trees(tmp_path_factory) -> dict[bool, Path]:
+def street_tree(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("overlay")
     inputs = write_inputs(folder / "inputs", [circling(3)])
-    return {
-        debug: render(
-            RenderConfig.model_validate({**SETTINGS, "debug": debug}), *inputs, folder / str(debug) / "render"
-        )
-        for debug in (True, False)
-    }
-
-
-def frame_of(tree: Path) -> Path:
-    return read_track(find_tracks(tree)[0]).frame_folder(1)
+    return render(RenderConfig.model_validate(SETTINGS), *inputs, folder / "render")
 
 
 @needs_gl
-def test_debug_pictures_are_written_where_they_are_asked_for(trees):
-    assert not list(trees[False].rglob("debug.png"))
-    (folder,) = find_tracks(trees[True])
-    named = [name for name in read_checksums(folder) if name.endswith("debug.png")]
-    assert len(named) == len(list(folder.rglob("debug.png"))) == 3
-    for name in ("rgb.png", "depth_float32.png", "instance.png"):
-        assert (frame_of(trees[True]) / name).read_bytes() == (frame_of(trees[False]) / name).read_bytes()
-
-
-@needs_gl
-def test_four_pictures_of_a_frame(trees, tmp_path):
-    result = invoke("view", trees[True], "--frame best --out", tmp_path / "a.png")
+def test_four_pictures_of_a_frame(street_tree, tmp_path):
+    boxes = tmp_path / "boxes_3d.json"
+    write_boxes(boxes, street())
+    result = invoke("view", street_tree, "--frame best --out", tmp_path / "a.png", "--map", boxes)
     assert result.exit_code == 0, result.output
     assert Image.open(tmp_path / "a.png").size == (640, 2 * (180 + 36))
-    name = four_panels(trees[False], tmp_path / "b.png", box_map=street())
+    name = four_panels(street_tree, tmp_path / "b.png", box_map=street())
     assert name in result.output
-    for frame in (name, str(trees[False] / name)):
-        assert four_panels(trees[False], tmp_path / "b.png", frame=frame, box_map=street()) == name
+    for frame in (name, str(street_tree / name)):
+        assert four_panels(street_tree, tmp_path / "b.png", frame=frame, box_map=street()) == name
     assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), np.asarray(Image.open(tmp_path / "b.png")))
-
-
-@needs_gl
-def test_without_boxes_there_is_one_clear_error(trees, tmp_path):
-    with pytest.raises(InputError, match=r"has no debug\.png.*--map.*render\.debug=true"):
-        four_panels(trees[False], tmp_path / "a.png")
     with pytest.raises(InputError):
-        four_panels(trees[True], tmp_path / "a.png", frame="../../elsewhere")
+        four_panels(street_tree, tmp_path / "a.png", frame="../../elsewhere", box_map=street())
+
+
+def test_a_frame_without_a_map_is_one_clear_error(tmp_path):
+    tmp_path.joinpath("tree").mkdir()
+    result = invoke("view", tmp_path / "tree", "--frame best --out", tmp_path / "a.png")
+    assert result.exit_code == 2
+    assert "--map" in result.output

@@ -139,8 +139,10 @@ def view(
 
         choice = job.cfg.inspect.flights
         if frame is not None:
-            box_map = None if map_ is None else read_boxes(map_)
-            typer.echo(gallery.four_panels(source, out, frame=None if frame == "best" else frame, box_map=box_map))
+            if map_ is None:
+                raise typer.BadParameter("--frame needs the map that was drawn, boxes_3d.json", param_hint="'--map'")
+            chosen = None if frame == "best" else frame
+            typer.echo(gallery.four_panels(source, out, box_map=read_boxes(map_), frame=chosen))
         elif out.suffix == ".png":
             gallery.contact_sheet(source, out, choice)
         else:

@@ -34,7 +34,6 @@ DepthFormat = Literal["png", "npy"]
 DEPTH_NPY, DEPTH_PNG = "depth.npy", "depth_float32.png"
 # Names in the public layout.
 FILE_NAMES: dict[FrameFile, str] = {"rgb": "rgb.png", "depth": DEPTH_NPY, "instance": "instance.png"}
-DEBUG_FILE = "debug.png"  # an optional picture for people, no label: no stage reads it
 FRAME_FILES = (*FILE_NAMES.values(), "meta.json")
 FILM_WIDTH_MM = 36.0  # width of a picture on 35 mm film
 # Limits of the horizontal field of view: towards 0 a picture shows a single point, towards 180 it degenerates.

@@ -6,7 +6,7 @@ Issues go into a Report, figures into FrameNumbers; the thresholds of acceptance
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -39,17 +39,16 @@ from cosfly.geometry.reprojection import LEAST_SEEN, Agreement, View, compare_vi
 from cosfly.geometry.trajectory_metrics import CLEARANCE_TOLERANCE_M
 from cosfly.inspection import settings as limits
 from cosfly.inspection.pixels import NUM_IDS, Picture, PixelFigures, measure_pixels, unpack
-from cosfly.runtime.arrays import array_header
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import CHECKSUMS, read_bytes, read_checksums, sha256_bytes, sha256_file
-from cosfly.runtime.png import picture_size
+from cosfly.runtime.png import png_size
 from cosfly.runtime.worker import advance
 
 # --- files ------------------------------------------------------------------------------------------------------------
 
 
 def check_files(track: Track, report: Report) -> dict[int, FrameMeta | None]:
-    """Check by the headers that every frame has its files, of the right size and type.
+    """Check that every frame has its files, and read the annotations.
 
     A tree of another program may lack a kind of file, such as `meta.json`, if its checksums list none.
 
@@ -75,8 +74,6 @@ def check_files(track: Track, report: Report) -> dict[int, FrameMeta | None]:
                 report.error("missing_file", where, "no such file", "one file per frame and modality")
             elif name == "meta.json":
                 meta = _check_meta(folder, i, where, report)
-            else:
-                _check_header(path, track, where, report)
         if len(report.issues) == num_issues:
             complete[i] = meta
     frames = track.folder / FRAMES_DIR
@@ -93,21 +90,6 @@ def _lists(folder: Path, names: list[str]) -> bool:
     except InputError:
         return True
     return any(public_name(name.rpartition("/")[2]) in names for name in listed)
-
-
-def _check_header(path: Path, track: Track, where: str, report: Report) -> None:
-    """Check type and size of a picture or a depth image by its header."""
-    assert track.folder is not None
-    tree = tree_of_track(track.folder)
-    width, height = (track.camera.width_px, track.camera.height_px)
-    is_depth = path.suffix == ".npy"
-    expected = f"float32 ({height}, {width})" if is_depth else f"a PNG of {width} x {height} px"
-    try:
-        got = str(array_header(path, tree=tree) if is_depth else picture_size(path, tree=tree) or "no PNG header")
-    except InputError as error:
-        got = str(error.got or error.what)
-    if got != (expected if is_depth else str((width, height))):
-        report.error("wrong_format", where, got, expected)
 
 
 def _check_meta(frame: Path, i: int, where: str, report: Report) -> FrameMeta | None:
@@ -133,23 +115,12 @@ def listed_digests(folder: Path, report: Report) -> dict[str, str]:
         return {}
 
 
-def compare_file(folder: Path, name: str, digest: str, report: Report, *, listed_in: str = CHECKSUMS) -> None:
+def compare_file(folder: Path, name: str, digest: str, report: Report) -> None:
     """Compare a file of a track with its digest."""
     if not (folder / name).is_file():
-        report.error("missing_file", name, "no such file", f"a file, listed in {listed_in}")
+        report.error("missing_file", name, "no such file", f"a file, listed in {CHECKSUMS}")
     elif sha256_file(folder / name) != digest:
-        report.error("checksum", name, "other bytes", f"the digest in {listed_in}")
-
-
-def check_recorded(folder: Path, root: Path, recorded: Mapping[str, str], report: Report) -> None:
-    """Compare a track's own records with its tree's manifest. recorded: path in the tree -> sha256."""
-    for name in ("trajectory.json", CHECKSUMS) if recorded else ():
-        digest = recorded.get((folder / name).relative_to(root).as_posix())
-        if digest is not None:
-            compare_file(folder, name, digest, report, listed_in="the tree's manifest")
-        elif name == "trajectory.json":
-            got = "no such entry in the tree's manifest"
-            report.error("not_of_this_tree", name, got, "a track that this manifest lists")
+        report.error("checksum", name, "other bytes", f"the digest in {CHECKSUMS}")
 
 
 # --- jumps ------------------------------------------------------------------------------------------------------------
@@ -257,11 +228,16 @@ def check_frames(
     jumps = dict[int, Agreement]()
     previous: tuple[int, np.ndarray] | None = None
     surfaces: tuple[int, View] | None = None  # of the previous frame with depth
+    size = track.camera.width_px, track.camera.height_px
     for i in indices:
         advance()
         where = frame_name(i)
         try:
-            picture = unpack(_read(track, i, digests, report), Path(where))
+            files = _read(track, i, digests, report)
+            if (got := png_size(files["rgb.png"])) != size:
+                report.error("wrong_format", f"{where}/rgb.png", str(got or "no PNG header"), str(size))
+                continue
+            picture = unpack(files, Path(where))
         except InputError as error:
             report.error("broken_image", str(error.where), f"{error.what}: {error.got}", "a file that decodes in full")
             continue

@@ -32,7 +32,7 @@ from cosfly.inspection.track import InspectedTrack, inspect_track, trace_id
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.pool import ItemOutcomes, Watch, run_items
-from cosfly.runtime.run_dir import Failed, Resume, StageFolder, recorded_digests, result_of
+from cosfly.runtime.run_dir import Failed, Resume, StageFolder, result_of
 from cosfly.runtime.worker import Item, Outcome, Work
 from cosfly.viz.page import run_name
 
@@ -45,11 +45,10 @@ def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None
 
     obstacles = None if simplified is None else obstacle_index(read_boxes(simplified))
     by_id = None if traces is None else {trace.path_id: trace for trace in read_traces(traces)}
-    recorded = recorded_digests(data)
     limit_degps = YAW_RATE_MAX_DEGPS if traces is None else read_yaw_rate_max(traces, YAW_RATE_MAX_DEGPS)
 
     def work(item: Item) -> Outcome:
-        inspected = inspect_track(data / item.payload, data, by_id, obstacles, cfg, recorded, limit_degps)
+        inspected = inspect_track(data / item.payload, data, by_id, obstacles, cfg, limit_degps)
         record = inspected.record
         return Outcome(
             inspected.model_dump(mode="json"), drop_reason=record.reason if record.result == "rejected" else None

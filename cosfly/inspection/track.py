@@ -5,8 +5,6 @@ The rendered poses are measured against the map, because the poses of a perturbe
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +17,6 @@ from cosfly.formats.issues import Report
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.formats.playback import Track, read_track
 from cosfly.formats.traces import DroneTrace
-from cosfly.formats.tracks import read_twin
 from cosfly.geometry.axes import project, step_s, world_from_camera, wrap_deg
 from cosfly.geometry.trajectory_metrics import (
     CLEARANCE_CAP_M,
@@ -33,14 +30,13 @@ from cosfly.inspection.frames import (
     check_bystanders,
     check_files,
     check_frames,
-    check_recorded,
     compare_file,
     listed_digests,
     target_box,
 )
 from cosfly.inspection.report import ReportPicture, pictures_of
 from cosfly.inspection.settings import InspectConfig
-from cosfly.runtime.errors import InputError, VerifyError
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.run_dir import digest_of, folder_digests
 from cosfly.runtime.worker import advance
 
@@ -64,7 +60,6 @@ def inspect_track(
     traces: dict[str, DroneTrace] | None,
     obstacles: BoxIndex | None,
     cfg: InspectConfig,
-    recorded: Mapping[str, str],
     yaw_rate_max_degps: float,
 ) -> InspectedTrack:
     """Check one track folder.
@@ -72,7 +67,6 @@ def inspect_track(
     Args:
         traces: Plans by id; None if the tree has none.
         obstacles: Of the map; None if there is no map.
-        recorded: sha256 by path of the tree's manifest; empty if there is none.
         yaw_rate_max_degps: Limit of the plans.
     """
     report = Report()
@@ -87,10 +81,8 @@ def inspect_track(
         report.warn("no_trace", "trajectory.json: source.scenario_id", got, "the id of a plan")
     if obstacles is not None:
         check_surroundings(track, obstacles, cfg, report, metrics)
-    check_shifts(track, report, metrics)
     check_motion(track, report)
     check_projection(track, report)
-    check_recorded(folder, root, recorded, report)
     _check_frames(track, cfg, report, metrics)
     issues = report.merged()
     result: Result = "accepted"
@@ -177,22 +169,6 @@ def check_surroundings(track: Track, obstacles: BoxIndex, cfg: InspectConfig, re
     if len(judged) and five_ray < cfg.five_ray_mean_min:
         expected = f"a mean of at least {cfg.five_ray_mean_min:g}"
         report.error("five_ray_visibility", "trajectory.json: points", f"{five_ray:.3f}", expected)
-
-
-def check_shifts(track: Track, report: Report, metrics: Metrics) -> None:
-    """Find frames of a perturbed track whose shift hides a target that is visible in the clean track."""
-    try:
-        twin = read_twin(track)
-    except VerifyError as error:
-        report.warn("no_twin", "trajectory.json", f"{error.what} ({error.got})", "a clean track of the same frames")
-        return
-    if twin is None:
-        return
-    is_hidden = is_shifted(track) & twin.target.visible & ~track.target.visible
-    metrics.update(num_hidden_by_shift=int(is_hidden.sum()))
-    for i in np.flatnonzero(is_hidden):
-        where = f"trajectory.json: points[{i}].target.visible"
-        report.warn("hidden_by_shift", where, "false, and true in the clean track", "no shift that hides the target")
 
 
 def is_shifted(track: Track) -> np.ndarray:

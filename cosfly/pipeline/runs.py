@@ -9,7 +9,6 @@ import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -18,15 +17,13 @@ import numpy as np
 from cosfly.formats.bystanders import BYSTANDERS_FILE
 from cosfly.formats.frames import LEGIBLE_HEIGHT_PX
 from cosfly.formats.inspection import undecided
-from cosfly.formats.pedestrian_paths import read_paths, walk_id, write_paths
+from cosfly.formats.pedestrian_paths import read_paths, write_paths
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
-from cosfly.maps.stage import load_map
 from cosfly.pipeline.command_settings import worker_options
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.stage import run as plan_trajectories
 from cosfly.planners.styles import ROWS
 from cosfly.render.stage import run as draw
-from cosfly.render.weather import dark_trajectories
 from cosfly.runtime.config import load
 from cosfly.runtime.console import duration
 from cosfly.runtime.errors import EnvironmentMissing, InputError, ResumeError
@@ -153,7 +150,6 @@ RATES = {  # stage: unit, seconds per unit, MB per unit
 SAMPLED_PEDESTRIANS, SAMPLED_TRAJECTORIES, SAMPLED_FRAMES = 64, 8, 4
 PERSON_M, PERSON_DEPTH_M = 1.75, 0.45  # height of a person, and extent in the plane
 SMALL_SHARE = 0.2  # of the time
-MOST_LISTED = 4  # trajectories named in a remark
 
 
 @dataclass(frozen=True)
@@ -346,21 +342,8 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
 
 
 def caveats(cfg: RunConfig) -> list[str]:
-    """Return remarks on settings that apply to some trajectories only, and on targets too small or too dark to see."""
-    lines = [*cfg.plan.remarks(), *small_targets(cfg)]
-    towns = cfg.all_towns() or {cfg.name: cfg}
-    for name, town in towns.items():
-        num_paths = town.pedestrians.num_paths
-        if dark := dark_trajectories(town.render, num_paths, partial(load_map, town.maps, seed=town.seed)):
-            listed = ", ".join(map(walk_id, dark[:MOST_LISTED]))
-            if len(dark) > MOST_LISTED:
-                listed += ", ..."
-            lines.append(
-                f"{name}: {len(dark)} of {num_paths} trajectories are dark ({listed}): they are at night, on a map "
-                "without street lamps, roads and pavements, so the target cannot be seen. Choose another time of day "
-                "(render.tod_name, render.tod_pool), another render.weather_seed, or a map with streets"
-            )
-    return lines
+    """Return remarks on settings that apply to some trajectories only, and on targets too small to see."""
+    return [*cfg.plan.remarks(), *small_targets(cfg)]
 
 
 def small_targets(cfg: RunConfig) -> list[str]:

@@ -15,7 +15,6 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M
@@ -23,7 +22,7 @@ from cosfly.formats.kinds import KIND_NAMES, KINDS
 from cosfly.formats.weather import WeatherParams
 from cosfly.render.contract import NEAR_M, NO_INSTANCE, Frame, PosedCar, PosedPerson, far_as_sky, instance_ids
 from cosfly.render.simulator import Body, NoPictureError, ServerCommand, SimulatorRenderer, placement_of
-from cosfly.runtime.errors import InputError, RenderError
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.simulators import conventions
@@ -38,16 +37,13 @@ PICTURE_SHARE = 1 / 3  # of timeout_s, in which a picture must come after its ti
 SENSORS = {"rgb": "rgb", "depth": "depth", "tags": "instance_segmentation"}
 MOVER_KINDS = ("Pedestrians", "Rider", "Car", "Truck", "Bus", "Motorcycle", "Bicycle")
 SAME_BOX_M = 0.05
+# Fixed exposure and no motion blur.
+RGB_ATTRIBUTES = {"exposure_mode": "manual", "motion_blur_intensity": "0.0", "motion_blur_max_distortion": "0.0"}
 SPAWN_M = 300.0  # over the map, where the air is free
 
 
 class CarlaRenderConfig(CarlaConfig, ServerCommand):
     """CARLA as a renderer; worker i asks the server at port + 10 i."""
-
-    rgb_attributes: dict[str, str] = Field(
-        {"exposure_mode": "manual", "motion_blur_intensity": "0.0", "motion_blur_max_distortion": "0.0"},
-        description="attributes of the blueprint of the RGB camera; default: fixed exposure and no motion blur",
-    )
 
 
 class CarlaRenderer(SimulatorRenderer):
@@ -194,10 +190,7 @@ class CarlaRenderer(SimulatorRenderer):
         for name, blueprint_name in SENSORS.items():
             blueprint = self._library.find(f"sensor.camera.{blueprint_name}")
             attributes = {"image_size_x": width, "image_size_y": height, "fov": f"{fov_deg:g}"}
-            for key, text in (attributes | (self._cfg.rgb_attributes if name == "rgb" else {})).items():
-                if not blueprint.has_attribute(key):
-                    fix = "remove this attribute from render.carla.rgb_attributes"
-                    raise RenderError("the camera has no attribute of this name", where=self.device, got=key, fix=fix)
+            for key, text in (attributes | (RGB_ATTRIBUTES if name == "rgb" else {})).items():
                 blueprint.set_attribute(key, text)
             inbox: queue.SimpleQueue = queue.SimpleQueue()
             camera = self._spawned(blueprint, pose)

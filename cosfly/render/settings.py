@@ -69,7 +69,6 @@ class RenderConfig(WeatherConfig):
         le=100,
         description="draw every n-th pose. With pedestrians.dt_s 0.1: 1 gives frames at 10 Hz, 5 frames at 2 Hz",
     )
-    debug: bool = Field(False, description="also write debug.png: boxes, ids and distances over the colours")
     visible_threshold: float = Field(
         0.1,
         ge=0,

@@ -27,7 +27,7 @@ from cosfly.render.person import choose_clothes, dress_bystanders, gait_of
 from cosfly.render.perturbation import PERTURBED, PerturbedTrack, Poses, Surroundings, perturb
 from cosfly.render.settings import RenderConfig
 from cosfly.render.track import VARIANTS, TrackScript, check_track, render_track
-from cosfly.render.weather import fog_hides, random_seed, read_pools, weathers_of
+from cosfly.render.weather import random_seed, read_pools, weathers_of
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.io import CHECKSUMS, atomic_folder, inside, sha256_bytes
@@ -37,7 +37,6 @@ from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Kept, Resume, StageFolder, Tally, checked_inputs, fingerprint, result_of
 from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.worker import Item, Outcome, Work
-from cosfly.viz.overlay import Overlay
 
 log = logging.getLogger(__name__)
 
@@ -161,7 +160,7 @@ def run(
     Trajectories that the planner dropped are not drawn; the manifest counts them. Returns the tree's root, `out`.
     """
     inputs = {"boxes": boxes, "simplified": simplified, "traces": traces} | ({"others": others} if others else {})
-    pools = read_pools(cfg)  # before anything is written
+    read_pools(cfg)  # checked before anything is written
     inputs |= cfg.pool_files()
     checked_inputs(inputs)  # before the map is read for the names of its meshes, which are inputs too
     box_map = read_boxes(boxes)
@@ -188,16 +187,6 @@ def run(
         log.warning("render: %d boxes share the instance id %d, because ids have 16 bits", num_shared, SHARED_ID)
     town, updates = _names(stage, cfg, box_map.name, traces, others, seed)
     cfg = cfg.model_copy(update=updates)
-    weathers = weathers_of(cfg, pools, (trace.drawn_as(number).number for number, trace in passed.items()))
-    hidden = []
-    for number, trace in passed.items():
-        nearest_m = float(np.linalg.norm(trace.positions_m - trace.targets_m, axis=1).min())
-        if fog_hides(weathers[trace.drawn_as(number).number], nearest_m):
-            hidden.append(trace.path_id)
-    if hidden:
-        log.warning(
-            "render: fog hides the target in all frames of %s; plan nearer to the target, or change the weather", hidden
-        )
     items = [
         Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track), len(trace.time_s[:: cfg.frame_stride]))
         for number, trace in passed.items()
@@ -301,7 +290,6 @@ def make_worker(cfg: RenderConfig, inputs: Inputs, out: Path, town: str, seed: i
     box_map = read_boxes(boxes)
     weathers = weathers_of(cfg, read_pools(cfg), (trace.drawn_as(n).number for n, trace in enumerate(all_traces)))
     renderer = renderer_of(cfg, box_map, num_others)
-    overlay = Overlay(box_map, instance_ids(box_map, num_others)) if cfg.debug else None
 
     def work(item: Item) -> Outcome:
         number, track = item.payload
@@ -312,7 +300,7 @@ def make_worker(cfg: RenderConfig, inputs: Inputs, out: Path, town: str, seed: i
         script = make_track_script(trace, number, track, town, surroundings, cfg, seed, trace_bystanders, weather)
         folder = out / town / script.trajectory / script.variant
         with atomic_folder(folder) as unfinished:
-            rendered = render_track(renderer, script, unfinished, cfg, overlay)
+            rendered = render_track(renderer, script, unfinished, cfg)
         result: dict[str, Any] = {
             "folder": str(folder.relative_to(out)),
             "num_frames": len(rendered),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -32,11 +32,8 @@ from cosfly.render.perturbation import HIDDEN, PERTURBED, STEP_UP_M, PerturbedTr
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.errors import RenderError
 from cosfly.runtime.io import sha256_bytes, sha256_file, storage_errors, write_checksums
-from cosfly.runtime.json_io import FileFormat, write_json
 from cosfly.runtime.worker import advance
-from cosfly.viz.overlay import Overlay
 
-REPORT_FORMAT = FileFormat("cosfly.perturbation_report", "1.0")
 VARIANTS = {"clean": "ORI", "perturbed": PERTURBED}
 MARGIN_M = 60.0  # shadows and sky openness are computed this far around the trajectory
 ENCODER_THREADS = 2  # of each worker, next to the drawing
@@ -83,15 +80,10 @@ def check_track(trace: DroneTrace, surroundings: Surroundings) -> None:
             raise RenderError(what, where=f"{trace.path_id}: frame {i}", got=got, expected=expected, fix=fix)
 
 
-def render_track(
-    renderer: Renderer, script: TrackScript, folder: Path, cfg: RenderConfig, overlay: Overlay | None = None
-) -> Track:
-    """Draw a track into a folder: frames, `trajectory.json`, `perturbation_report.json`, `checksums.sha256`.
+def render_track(renderer: Renderer, script: TrackScript, folder: Path, cfg: RenderConfig) -> Track:
+    """Draw a track into a folder: frames, `trajectory.json`, `checksums.sha256`.
 
     A shift is dropped if it hides a target that is visible without it, which only the drawn frame shows.
-
-    Args:
-        overlay: Draws `debug.png`; None writes none.
 
     Returns:
         The track as it was written.
@@ -101,27 +93,15 @@ def render_track(
     places = np.concatenate([poses.positions_m, poses.targets_m])
     weather = None if script.weather is None else script.weather.params
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M, weather)
-    drawn = _draw_frames(renderer, script, folder, cfg, overlay)
+    drawn = _draw_frames(renderer, script, folder, cfg)
     track = _with_goal(_track(script, drawn), renderer, script, cfg)
     write_track(folder, track)
-    write_json(folder / "perturbation_report.json", {**REPORT_FORMAT.header, **_report(script.perturbed)})
-    file_names = ["trajectory.json", "perturbation_report.json"]
+    file_names = ["trajectory.json"]
     if track.goal is not None and "rgb" in cfg.modalities:
         _write_target_picture(folder, track.goal.frame, drawn.targets[track.goal.frame])
         file_names.append(TARGET_FILE)
     write_checksums(folder, drawn.digests | {name: sha256_file(folder / name) for name in file_names})
     return track
-
-
-def _report(perturbed: PerturbedTrack) -> dict[str, Any]:
-    """Return the content of `perturbation_report.json`."""
-    outcomes = {event: Counter(state[event] for state in perturbed.states) for event in ("position", "rotation")}
-    return {
-        "num_frames": len(perturbed.states),
-        "num_perturbed": int(perturbed.is_perturbed.sum()),
-        "clearance_min_m": round(float(perturbed.poses.clearances_m.min()), 4),
-        **{event: dict(sorted(counts.items())) for event, counts in outcomes.items()},
-    }
 
 
 def _write_target_picture(folder: Path, i: int, target: TargetMeta) -> None:
@@ -151,9 +131,7 @@ class DrawnFrames(NamedTuple):
     digests: dict[str, str]  # file -> sha256
 
 
-def _draw_frames(
-    renderer: Renderer, script: TrackScript, folder: Path, cfg: RenderConfig, overlay: Overlay | None
-) -> DrawnFrames:
+def _draw_frames(renderer: Renderer, script: TrackScript, folder: Path, cfg: RenderConfig) -> DrawnFrames:
     """Draw and write all frames; encode in threads while the next ones are drawn."""
     perturbed = script.perturbed
     people = script.bystanders.people(script.clothes.looks) if renderer.dresses else None
@@ -178,7 +156,7 @@ def _draw_frames(
             target_m = perturbed.poses.targets_m[i]
             drawn.visibility.append(shown.target.visibility)
             drawn.bystanders.append({} if annotated is None else {"others": annotated.people_of(target_m, people)})
-            pending.append(pool.submit(_write_frame, folder, shown.frame, _annotation(script, i, shown), cfg, overlay))
+            pending.append(pool.submit(_write_frame, folder, shown.frame, _annotation(script, i, shown), cfg))
             advance()
             while len(pending) >= FRAMES_AHEAD:
                 collect_oldest()
@@ -251,9 +229,7 @@ def _annotation(script: TrackScript, i: int, drawn: DrawnFrame) -> FrameMeta:
     )
 
 
-def _write_frame(
-    folder: Path, frame: Frame, meta: FrameMeta, cfg: RenderConfig, overlay: Overlay | None
-) -> tuple[TargetMeta, dict[str, str]]:
+def _write_frame(folder: Path, frame: Frame, meta: FrameMeta, cfg: RenderConfig) -> tuple[TargetMeta, dict[str, str]]:
     """Encode and write one frame, in a thread; return the target's annotation, and file name -> sha256."""
     name = frames.frame_name(meta.index)
     meta = meta.model_copy(update={"target": written_target(meta.target, frame)})
@@ -264,8 +240,6 @@ def _write_frame(
         contents |= [frames.depth_file(frame.depth, cfg.depth_format)]
     if "instance" in cfg.modalities:
         contents[frames.FILE_NAMES["instance"]] = frames.instance_bytes(frame.kinds, frame.ids)
-    if overlay is not None:
-        contents[frames.DEBUG_FILE] = frames.rgb_bytes(overlay.draw(frame.rgb, frame.ids, meta))
     contents["meta.json"] = meta.to_bytes()
     with storage_errors(folder / name):
         (folder / name).mkdir(parents=True, exist_ok=True)

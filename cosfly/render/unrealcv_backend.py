@@ -36,6 +36,7 @@ MOST_CHECKED = 200  # objects that are compared with the map
 SAME_BOX_M = 1.0  # largest median distance of objects from their boxes
 SAME_PLACE_M = 0.1  # largest distance of the camera from where it was put
 COLORS = 1 << 24
+CAMERA = "/camera/0"  # the first of `vget /cameras`
 
 
 class UnrealCvRenderConfig(UnrealCvConfig, ServerCommand):
@@ -45,7 +46,6 @@ class UnrealCvRenderConfig(UnrealCvConfig, ServerCommand):
         0.0, description="offset added to all heights, m, if the heights of map and level differ"
     )
     settle_delay_s: float = Field(0.1, ge=0, description="time that the engine runs after a pose is set, s")
-    camera: int = Field(0, ge=0, description="number of the camera, of `vget /cameras`")
     animate: bool = Field(True, description="people walk while the engine settles; false: they are only placed")
     person_asset: ClassVar[str] = "/Game/TrafficSystem/Pedestrian/Base_User_Agent.Base_User_Agent_C"
     car_asset: ClassVar[str] = "/Game/TrafficSystem/Vehicle/Vehicle1.Vehicle1_C"
@@ -83,18 +83,14 @@ class UnrealCvRenderer(SimulatorRenderer):
         self._spawned: dict[int, str] = {}
         self._fov_deg = 0.0
         if is_first and self._guard is not None:
-            properties = [f"{self._camera}/{what}" for what in ("size", "fov", "pose")]
+            properties = [f"{CAMERA}/{what}" for what in ("size", "fov", "pose")]
             state = zip(properties, self._server.ask(*(f"vget {name}" for name in properties)), strict=True)
             self._guard.note([f"vset {name} {text!s}" for name, text in state if not is_refusal(text)])
         names = str(*self._server.ask("vget /objects"))
         leftover = spawned_by_cosfly(names)  # by a connection that broke
         self._server.run(*(f"vset /object/{name}/destroy" for name in leftover))
         self._link([name for name in names.split() if name not in leftover])
-        self._server.run(f"vset {self._camera}/size {self._size_px[0]} {self._size_px[1]}")
-
-    @property
-    def _camera(self) -> str:
-        return f"/camera/{self._cfg.camera}"
+        self._server.run(f"vset {CAMERA}/size {self._size_px[0]} {self._size_px[1]}")
 
     def _link(self, names: list[str]) -> None:
         """Make the tables from colours of the object mask to instance ids and kinds."""
@@ -190,17 +186,17 @@ class UnrealCvRenderer(SimulatorRenderer):
             for number, body in bodies.items():
                 commands += self._placing(number, body)
             if fov_deg != self._fov_deg:
-                commands.append(f"vset {self._camera}/fov {fov_deg:.6f}")
-            self._server.run(*commands, f"vset {self._camera}/pose {place} {turn}")
+                commands.append(f"vset {CAMERA}/fov {fov_deg:.6f}")
+            self._server.run(*commands, f"vset {CAMERA}/pose {place} {turn}")
             self._fov_deg = fov_deg
             time.sleep(self._cfg.settle_delay_s)
             replies = ("location", "lit png", "object_mask png", "depth npy")
-            commands = ["vset /action/game/pause", *(f"vget {self._camera}/{what}" for what in replies)]
+            commands = ["vset /action/game/pause", *(f"vget {CAMERA}/{what}" for what in replies)]
             _, location, lit, mask, depth = self._server.ask(*commands)
             self._check_place(camera_pose[:3, 3], location)
             return self._decoded(lit, mask, depth)
         except (NoAnswerError, InputError) as error:
-            raise NoPictureError(f"camera {self._cfg.camera}: {error}") from None
+            raise NoPictureError(str(error)) from None
 
     def _in_level(self, position_m: np.ndarray, rotation_deg: np.ndarray) -> tuple[str, str]:
         """Return a position in the level's units and its rotation, as words of commands."""
@@ -221,7 +217,7 @@ class UnrealCvRenderer(SimulatorRenderer):
             heights = zip(both.round(2).tolist(), over_m, strict=True)
             got, expected = (f"{point}, {over:.1f} m over the ground" for point, over in heights)
             what = "the camera is not at the requested position"
-            fix = "stop the level from moving the camera (such as by gravity), or choose another render.unrealcv.camera"
+            fix = "stop the level from moving the camera, such as by gravity"
             raise RenderError(what, where=self.device, got=got, expected=expected, fix=fix)
 
     def _decoded(self, lit: str | bytes, mask: str | bytes, depth: str | bytes) -> Frame:

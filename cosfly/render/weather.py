@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import random
 import secrets
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice, product
 from pathlib import Path
@@ -14,9 +13,6 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.formats.boxes import BoxMap
-from cosfly.formats.frames import LEGIBLE_CONTRAST
-from cosfly.formats.kinds import KINDS
 from cosfly.formats.weather import (
     TIMES,
     WEATHERS,
@@ -36,9 +32,6 @@ from cosfly.runtime.seeding import draw_to_quota, rng_for
 FOG_AT_FULL = 0.10  # extinction per m at a fog density of 100 percent
 FOG_POWER = 2.4  # of the fog density: dense fog (80 percent) leaves 5 % of the colours 60 m away
 RAIN_EXTINCTION = 0.0045  # extinction per m of the heaviest rain: a visibility of some 700 m
-STRONGEST_CONTRAST = 75.0  # measured colour difference (CIE76) between clothes and ground in clear air
-CONTRAST_POWER = 1.75  # contrast falls as this power of the transmitted share of light: measured
-LIT_KINDS = {KINDS[name] for name in ("Poles", "Roads", "Sidewalks")}  # kinds of boxes that carry lamps
 Preset = TypeVar("Preset", WeatherPreset, TimePreset)
 DEFAULT_SEED = 20260423  # the seed of the paper's production runs (app:weather:coverage)
 
@@ -235,35 +228,7 @@ def _draw_evenly(pools: Pools, seed: int) -> tuple[str, str]:
     return weather, time
 
 
-def dark_trajectories(cfg: WeatherConfig, num: int, read_map: Callable[[], BoxMap]) -> list[int]:
-    """Return the indices of trajectories with black pictures: those at night on a map without lamps.
-
-    Args:
-        num: The number of trajectories.
-        read_map: Called only if a trajectory is at night.
-
-    Returns:
-        An empty list if `weather_seed` is negative: the weather is then not drawn yet.
-    """
-    if cfg.weather_mode == "off" or cfg.weather_seed < 0:
-        return []
-    weathers = weathers_of(cfg, read_pools(cfg), range(num))
-    at_night = [
-        index for index, weather in weathers.items() if weather and sky_kind(weather.params).startswith("night")
-    ]
-    return at_night if at_night and not read_map().is_any_of(LIT_KINDS).any() else []
-
-
 def fog_extinction(params: WeatherParams) -> float:
     """Return the extinction of fog and rain, per m."""
     rain = params.precipitation / 100.0
     return float(FOG_AT_FULL * (params.fog_density / 100.0) ** FOG_POWER + RAIN_EXTINCTION * rain**1.5)
-
-
-def fog_hides(weather: WeatherRecord | None, distance_m: float) -> bool:
-    """Return whether fog and rain make a person illegible at a distance."""
-    optical_depth = 0.0
-    if weather is not None:
-        params = weather.params
-        optical_depth = fog_extinction(params) * max(0.0, distance_m - params.fog_distance)
-    return math.exp(-CONTRAST_POWER * optical_depth) * STRONGEST_CONTRAST < LEGIBLE_CONTRAST

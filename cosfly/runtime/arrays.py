@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import os
 import threading
 from pathlib import Path
 from tokenize import TokenError
@@ -14,7 +13,6 @@ import numpy as np
 from numpy.lib import format as npy
 
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import disk_errors, open_file
 from cosfly.runtime.png import check_pixels
 
 MOST_HEADER_BYTES = 10_000  # NumPy's own limit
@@ -33,12 +31,6 @@ class ArrayHeader(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.dtype} {self.shape}"
-
-
-def array_header(path: Path, *, tree: Path | None = None) -> ArrayHeader:
-    """Read the header of a `.npy` file, and check that the file is complete."""
-    with open_file(path, what="array", tree=tree) as file, disk_errors(path, "array"):
-        return _header(file.read(MOST_HEADER_BYTES + PREFIX_BYTES), os.fstat(file.fileno()).st_size, path, "array")
 
 
 def parse_array(

@@ -18,7 +18,7 @@ from isal import isal_zlib as zlib
 
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import disk_errors, open_file, over_limit, read_bytes
+from cosfly.runtime.io import over_limit, read_bytes
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_HEADER_BYTES = 24  # signature, length and name of the first chunk, width, height
@@ -46,12 +46,6 @@ def png_size(data: bytes) -> tuple[int, int] | None:
         return None
     width, height = struct.unpack_from(">II", data, 16)
     return width, height
-
-
-def picture_size(path: Path, *, tree: Path | None = None) -> tuple[int, int] | None:
-    """Return (width, height) in px from the header of a PNG file; None for another file."""
-    with open_file(path, what="image", tree=tree) as file, disk_errors(path, "image"):
-        return png_size(file.read(PNG_HEADER_BYTES))
 
 
 def read_picture(path: Path, *, tree: Path | None = None) -> np.ndarray:

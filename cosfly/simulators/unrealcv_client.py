@@ -17,7 +17,7 @@ from typing import Any
 from pydantic import Field
 
 from cosfly.runtime.config import Config, MayDiffer
-from cosfly.runtime.errors import ConfigError, EnvironmentMissing
+from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.escaping import for_terminal
 
 PROBE_S = 5.0  # for a server to accept a connection
@@ -31,7 +31,6 @@ class UnrealCvConfig(Config):
 
     host: MayDiffer[str] = Field("127.0.0.1", min_length=1, description="address of the server")
     port: MayDiffer[int] = Field(9000, ge=1, le=65535, description="port of the server; often 9001 if 9000 is in use")
-    level: str | None = Field(None, pattern=r"^[\w/.-]+$", description="level to open; null uses the open one")
     timeout_s: MayDiffer[float] = Field(60.0, gt=0, description="time limit for an answer, s")
     coord_scale: float = Field(100.0, gt=0, description="Unreal units per metre; 100: centimetres")
 
@@ -107,7 +106,7 @@ def is_refusal(answer: str | bytes | None) -> bool:
 
 
 def connect(cfg: UnrealCvConfig, port: int) -> UnrealCvConnection:
-    """Connect to the server at a port, check its version, and have it open the level."""
+    """Connect to the server at a port, and check its version."""
     with _server_errors("no UnrealCV server answers", f"{cfg.host}:{port} (UnrealCV unknown)"):
         connection = UnrealCvConnection(cfg, port)
         version, level = connection.ask("vget /unrealcv/version", "vget /level/name")
@@ -122,30 +121,7 @@ def connect(cfg: UnrealCvConfig, port: int) -> UnrealCvConnection:
         )
     connection.version = match[0]
     connection.level = "" if is_refusal(level) else for_terminal(str(level).strip())
-    if cfg.level in (None, connection.level):
-        return connection
-    return _opened(cfg, port, connection)
-
-
-def _opened(cfg: UnrealCvConfig, port: int, connection: UnrealCvConnection) -> UnrealCvConnection:
-    """Open the level and wait for it; a server may drop its client meanwhile."""
-    before = connection.where
-    until_s = time.monotonic() + cfg.timeout_s
-    answer = None
-    with contextlib.suppress(NoAnswerError):
-        (answer,) = connection.ask(f"vset /action/game/level {cfg.level}")
-    while answer is None or not is_refusal(answer):
-        connection.close()
-        with contextlib.suppress(EnvironmentMissing):
-            connection = connect(cfg.model_copy(update={"level": None}), port)
-            if connection.level == cfg.level:
-                return connection
-        if time.monotonic() > until_s:
-            break
-        time.sleep(0.5)
-    connection.close()
-    fix = "set unrealcv.level to a level that Unreal has, or open the level in Unreal and remove the setting"
-    raise ConfigError("the server did not open the level", where=before, got=cfg.level, fix=fix)
+    return connection
 
 
 def _client(cfg: UnrealCvConfig, port: int) -> Any:

@@ -63,7 +63,7 @@ def run(
 
     def draw(fov_deg: float, path_index: int | None = None) -> list[Track]:
         level = {"fovs_deg": (fov_deg,), "zoom": ZoomConfig(), "frame_stride": every, "path_index": path_index}
-        files = {"tracks": ("clean",), "modalities": ("rgb",), "debug": False, "first_timestamp": 0}
+        files = {"tracks": ("clean",), "modalities": ("rgb",), "first_timestamp": 0}
         settings = cfg.model_copy(update=level | files | {"weather_mode": "off"})
         tree = cosfly.render.stage.run(settings, boxes, simplified, traces, tree_of(out, fov_deg), **options)
         return [read_track(folder) for folder in find_tracks(tree)]

@@ -10,14 +10,13 @@ import numpy as np
 from PIL import Image
 
 from cosfly.formats.boxes import BoxMap
-from cosfly.formats.frames import DEBUG_FILE, FRAME_FILES, frame_path, read_instance, read_meta, read_rgb, rgb_bytes
+from cosfly.formats.frames import FRAME_FILES, frame_path, read_instance, read_meta, read_rgb, rgb_bytes
 from cosfly.formats.places import ALL_TRACKS, TrackChoice
 from cosfly.formats.playback import Track, read_track
 from cosfly.formats.town import read_instance_ids
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import inside, write_bytes
-from cosfly.runtime.png import read_picture
 from cosfly.viz.frame_views import DEPTH_RANGE_M, VIEW_FILES, read_view, spread
 from cosfly.viz.overlay import Overlay
 from cosfly.viz.topview import captioned_grid, draw_text
@@ -50,12 +49,12 @@ def preview_gif(
     write_bytes(out_gif, _gif(pictures, round(1000 / frames_per_s)))
 
 
-def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map: BoxMap | None = None) -> str:
+def four_panels(tree: Path, out_png: Path, *, box_map: BoxMap, frame: str | None = None) -> str:
     """Read a frame of a playback tree; write a PNG: colours, depth, instances, and boxes with ids and distances.
 
     Args:
         frame: Its folder, as for `frame_in`; None is the frame of the first clean track that shows most of the target.
-        box_map: The drawn map, for a frame without `debug.png`.
+        box_map: The drawn map.
 
     Returns:
         The frame's folder in the tree.
@@ -63,19 +62,13 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
     folder = best_frame(tree, *FRAME_FILES) if frame is None else frame_in(tree, frame)
     meta = read_meta(folder)
     rgb = read_rgb(folder)
-    if (folder / DEBUG_FILE).exists():
-        debug = read_picture(folder / DEBUG_FILE, tree=tree)
-    elif box_map is not None:
-        ids = read_instance_ids(folder.parents[3]).of_boxes(box_map)
-        debug = Overlay(box_map, ids).draw(rgb, read_instance(folder)[1], meta)
-    else:
-        fix = "pass --map boxes_3d.json, or render with --set render.debug=true"
-        raise InputError("the frame has no debug.png, and no map is given to draw its boxes", where=folder, fix=fix)
+    overlay = Overlay(box_map, read_instance_ids(folder.parents[3]).of_boxes(box_map))
+    boxes = overlay.draw(rgb, read_instance(folder)[1], meta)
     panels = [
         (f"RGB, {meta.camera.fov_deg:.0f} deg", rgb),
         (f"depth, black: {DEPTH_RANGE_M:g} m and beyond", read_view(folder, "depth")),
         ("instances, the target red", read_view(folder, "segmentation")),
-        (f"boxes, ids, distances; visibility {meta.target.visibility:.2f}", debug),
+        (f"boxes, ids, distances; visibility {meta.target.visibility:.2f}", boxes),
     ]
     write_bytes(out_png, rgb_bytes(captioned_grid(panels, 2)))
     return folder.relative_to(tree).as_posix()

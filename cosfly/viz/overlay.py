@@ -1,4 +1,4 @@
-"""A frame's labels drawn over its colours (`debug.png`): the 3D boxes of map, target and bystanders, with ids and
+"""A frame's labels drawn over its colours: the 3D boxes of map, target and bystanders, with ids and
 distances.
 
 The boxes are projected again from `meta.json` and the map, so a line that does not fit reveals an error in either.
