@@ -234,8 +234,8 @@ def check_frames(
         where = frame_name(i)
         try:
             files = _read(track, i, digests, report)
-            if (got := png_size(files["rgb.png"])) != size:
-                report.error("wrong_format", f"{where}/rgb.png", str(got or "no PNG header"), str(size))
+            if (found := png_size(files["rgb.png"])) != size:
+                report.error("wrong_format", f"{where}/rgb.png", str(found or "no PNG header"), str(size))
                 continue
             picture = unpack(files, Path(where))
         except InputError as error:

@@ -37,13 +37,11 @@ PLANNERS = {
     "muco": "cosfly.planners.muco.muco:plan",
 }
 # Generic planners without a visibility term, for `plan compare --planner all` (app:three_axis_eval).
-_REFERENCE_MODULES = {
-    "rrt_star": "sampling", "prm": "sampling", "bspline_prm": "sampling", "elastic_band": "optimization",
-    "minimum_jerk": "optimization", "astar": "graph_search", "weighted_astar": "graph_search",
-    "theta_star": "graph_search", "visibility_astar": "graph_search", "potential_field": "optimization",
-    "chomp": "optimization", "trajopt": "optimization",
-}  # fmt: skip
-REFERENCES = {name: f"cosfly.planners.reference.{module}:plan_{name}" for name, module in _REFERENCE_MODULES.items()}
+_REFERENCE_NAMES = (
+    "rrt_star", "prm", "bspline_prm", "elastic_band", "minimum_jerk", "astar", "weighted_astar", "theta_star",
+    "visibility_astar", "potential_field", "chomp", "trajopt",
+)  # fmt: skip
+REFERENCES = {name: f"cosfly.planners.reference_planners:plan_{name}" for name in _REFERENCE_NAMES}
 ALL_PLANNERS = PLANNERS | REFERENCES
 # Titles for tables and pictures; other planners are shown by their names.
 TITLES = {

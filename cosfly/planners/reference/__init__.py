@@ -1,1 +1,0 @@
-"""The paper's reference planners (app:three_axis_eval): generic ones, without a visibility term."""
