@@ -5,6 +5,7 @@ The rendered poses are measured against the map, because the poses of a perturbe
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
