@@ -22,13 +22,9 @@ def invoke(*words: object) -> Result:
 
 @contextlib.contextmanager
 def working_here() -> Iterator[None]:
-    """Work on items in this process, since each worker takes seconds to begin; `bench` measures workers and keeps
-    them."""
-    in_processes = pool._in_processes
+    """Work on items in this process, since each worker takes seconds to begin."""
 
     def work(stage: Any, items: Any, start: Any, workers: int, watch: Any, progress: Any) -> Any:
-        if "bench" in stage.path.parts:
-            return in_processes(stage, items, start, workers, watch, progress)
         return pool._in_this_process(items, start, progress.move)
 
     with mock.patch.object(pool, "_in_processes", work):

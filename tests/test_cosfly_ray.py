@@ -3,7 +3,6 @@
 import contextlib
 import logging
 import os
-import re
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -109,11 +108,6 @@ def meanwhile(folder: Path, num_done: int, do: Callable[[], object]) -> Iterator
     doing.result()
 
 
-def products(root: Path) -> dict[str, bytes]:
-    """Give what stands below a folder; not how many steps lost workers had done, which a manifest tells."""
-    return {name: re.sub(rb',\s*"lost_steps": \d+', b"", data) for name, data in contents(root).items()}
-
-
 def kill_worker(folder: Path) -> None:
     os.kill([event.pid for event in read_events(folder) if event.event in ("worker_started", "restarted")][-1], 9)
 
@@ -138,7 +132,7 @@ def test_a_run_has_the_bytes_of_the_local_engine_though_workers_and_nodes_are_lo
         events = read_events(Path("run") / name)
         assert sum(event.event in LOSSES for event in events) >= least
         assert all(event.attempt == 1 for event in events if event.event == "retried")
-    assert differences(products(tmp_path / "cluster"), products(tmp_path / "local")) == []
+    assert differences(contents(tmp_path / "cluster"), contents(tmp_path / "local")) == []
 
 
 def refused(tmp_path: Path, words: str, watch: Watch) -> None:

@@ -1,31 +1,30 @@
-"""Studies of depth, beam and zoom; `cosfly bench`; `cosfly reproduce`."""
+"""Studies of depth and zoom; `cosfly reproduce`."""
 
 import json
 
 import numpy as np
 import pytest
 from commands import invoke
-from specimens_planning import CANYON, town_of, walk_along
 from test_cosfly_render import needs_gl
 from test_render_camera import IN_THE_WALL
 from test_renderers_contract import circling, write_inputs
 from toy_workers import make_counting_worker, stage_in
 
-from cosfly.formats.boxes import write_boxes
-from cosfly.formats.pedestrian_paths import write_paths
-from cosfly.pipeline.bench import Bench, bench_run, run, tables, watchdog_figures
-from cosfly.pipeline.reproduce import OF_RELEASE, FigureReader, MissingFile, read_paper
-from cosfly.pipeline.settings import RunConfig
-from cosfly.planners.contract import PlanConfig
-from cosfly.runtime.errors import ConfigError, InputError, ResumeError
-from cosfly.runtime.events import Event
+from cosfly.pipeline.reproduce import (
+    OF_RELEASE,
+    FigureReader,
+    MissingFile,
+    read_paper,
+    rendering_figures,
+    watchdog_figures,
+)  # fmt: skip
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.events import Event, read_events
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.json_io import write_json
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Manifest, Tally, read_manifest
 from cosfly.runtime.worker import Item
-from cosfly.studies import beam
-from cosfly.studies.beam import FIGURES, PAPER_BEAM, Planned
 from cosfly.studies.depth import study_of
 from cosfly.studies.zoom import enlarged_fov_deg, tree_of
 from release.card.tables import SHAPES
@@ -53,34 +52,6 @@ def test_depths_spread_evenly_give_the_papers_errors():
         assert row["psnr_db"] == pytest.approx(psnr_db, abs=0.3)
         kib = 360 * 640 * int(coding.removesuffix("-bit")) / 8 / 1024
         assert row["kilobytes"] == pytest.approx(kib), "as the paper's column counts them"
-
-
-def planned(value, reason=None):
-    return Planned(figures=None if value is None else dict.fromkeys(FIGURES, value), reason=reason)
-
-
-def test_differences_are_those_of_the_walks_that_both_fly():
-    many = {
-        PAPER_BEAM: [planned(1.0), planned(5.0), planned(None, "no_path")],
-        64: [planned(3.0), planned(None, "no_path"), planned(9.0)],
-    }
-    rows = beam.summarize(many, np.random.default_rng(0))
-    assert rows[64]["figures"]["length_m"] == {"mean": 3.0, "difference": 2.0, "low": 2.0, "high": 2.0}
-    assert rows[64]["kept"] == 2
-    nobody = beam.summarize({PAPER_BEAM: [planned(None, "no_path")]}, np.random.default_rng(0))
-    assert nobody[PAPER_BEAM] == {"walks": 1, "kept": 0, "figures": {}}
-
-
-@pytest.mark.slow
-def test_the_study_of_beams_twice_gives_the_same_bytes(tmp_path, in_this_process):
-    write_boxes(tmp_path / "map.json", town_of(*CANYON))
-    write_paths(tmp_path / "path.json", [walk_along("path_00000", [(0, 0), (30, 0)])], {})
-    one, two = (
-        beam.run(PlanConfig(), tmp_path / "map.json", tmp_path / "path.json", tmp_path / out, workers=1)
-        for out in ("one", "two")
-    )
-    assert one.read_bytes() == two.read_bytes()
-    assert json.loads(one.read_text())["beams"]["2048"]["kept"] == 1
 
 
 LEVELS = [110.0, 60.0, 30.0]
@@ -125,14 +96,12 @@ EVENTS = [
     event(0, "began", workers=2),
     event(0, "worker_started", worker=0, pid=1),
     event(0, "worker_started", worker=1, pid=2),
-    event(
-        4, "probe", rss_mib={0: 100.0, 1: 120.0}, cores_used=1.0, disk_free_mib=1.0, gpu_percent=40.0, gpu_mib=2048.0
-    ),
+    event(4, "probe", rss_mib={0: 100.0, 1: 120.0}, cores_used=1.0, disk_free_mib=1.0),
     event(10, "item_done", worker=0, item="a", status="kept", seconds=8.0, steps=40),
     event(12, "worker_died", worker=1, pid=2, item="b", seconds=9.0, steps=30),
     event(12, "retried", item="b", attempt=1),
     event(13, "restarted", worker=1, pid=3),
-    event(14, "probe", rss_mib={0: 90.0}, cores_used=2.0, disk_free_mib=1.0, gpu_percent=50.0, gpu_mib=1024.0),
+    event(14, "probe", rss_mib={0: 90.0}, cores_used=2.0, disk_free_mib=1.0),
     event(20, "item_done", worker=1, item="b", status="kept", seconds=5.0, steps=40),
     event(20, "item_done", worker=0, item="c", status="dropped", seconds=5.0, steps=10),
     event(20, "ended"),
@@ -141,55 +110,18 @@ MANIFEST = Manifest(stage="render", outputs=[], counts=Tally(input=3, kept=2, dr
 
 
 def test_figures_of_a_run():
-    row = bench_run(EVENTS, MANIFEST, 2, counts_frames=True)
-    assert (row.attempted, row.successful, row.per_s) == (120, 80, 4.0)
-    assert (row.restarts, row.failed) == (1, 0)
-    assert (row.peak_memory_mib, row.cores_used) == (220.0, 1.5)
-    assert (row.gpu_percent, row.gpu_gib) == (45.0, 2.0)
-    without = [one.model_copy(update={"gpu_percent": None, "gpu_mib": None}) for one in EVENTS]
-    assert bench_run(without, MANIFEST, 2, counts_frames=True).gpu_percent is None
-    items = bench_run(EVENTS, MANIFEST, 2, counts_frames=False)
-    assert (items.attempted, items.successful) == (4, 2)
+    assert rendering_figures(EVENTS, MANIFEST) == {"2 workers": [20.0, 120, 80, 4.0, 1.0, 1.5, 220.0, 1, 0]}
 
 
-def test_tables_are_those_of_the_paper():
-    about = {"cores_used": 1.5, "peak_memory_mib": 300.0, "restarts": 0, "failed": 0, "seconds": 10.0}
-    counts = [{"workers": n, "attempted": 100 * n, "successful": 100 * n} for n in (1, 2)]
-    bench = Bench.model_validate({"stage": "render", "cores": 2, "rows": [about | row for row in counts]})
-    head, *rows = tables(bench)["render on 2 cores"]
-    assert [dict(zip(head, row, strict=True))["speed-up"] for row in rows] == ["1.00x", "2.00x"]
-    assert rows[1][:6] == ("2", "10.0", "200", "200", "20.00", "2.00x")
-    assert "NVIDIA GPUs" not in tables(bench)
-    seen = bench.rows[1].model_copy(update={"gpu_percent": 58.6, "gpu_gib": 10.6})
-    bench.rows[1] = seen
-    assert tables(bench)["NVIDIA GPUs"][2] == ("2", "58.6", "10.6")
-
-
-def test_what_lost_workers_had_done_is_counted_and_left_out(tmp_path):
+def test_what_lost_workers_had_done_is_counted(tmp_path):
     items = [Item("a", "once-die", num_steps=3), Item("b", num_steps=3)]
     folder = stage_in(tmp_path)
     finished = run_items(folder, items, make_counting_worker, (tmp_path,), workers=1, watch=Watch(heartbeat_s=0.2))
     (tmp_path / "s/product").write_text("x")
     folder.finish([tmp_path / "s/product"], finished.tally)
-    assert read_manifest(tmp_path / "s").facts["lost_steps"] == 3
-    launches, restarts, _, losses = watchdog_figures(tmp_path / "s")
-    assert (launches, restarts, losses) == (2, 1, {"worker_died": 1})
-
-
-def test_what_cannot_be_measured(tmp_path):
-    with pytest.raises(ConfigError, match=r"the benchmark cannot measure this stage.*simplify.*render"):
-        run(RunConfig(), tmp_path, tmp_path / "out", "simplify", [1])
-    asked = RunConfig.model_validate({"caption": {"teacher": "http://127.0.0.1:9"}})
-    with pytest.raises(ConfigError, match="a teacher or judge on a server does not use"):
-        run(asked, tmp_path, tmp_path / "out", "caption", [1])
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out/mine").touch()
-    with pytest.raises(ResumeError, match="not empty"):
-        run(RunConfig(), tmp_path, tmp_path / "out", "render", [1])
-    (tmp_path / "run.yaml").write_text("{}")
-    for counts in ("two", "0,1", ""):
-        answer = invoke("bench", tmp_path, "--out", tmp_path / "o", "--workers", [counts])
-        assert answer.exit_code == 2
+    events, manifest = read_events(tmp_path / "s"), read_manifest(tmp_path / "s")
+    assert sum(event.steps for event in events if event.event == "worker_died") == 3
+    assert watchdog_figures(events, manifest) == [2, 1, manifest.seconds, {"worker_died": 1}]
 
 
 # All labels of tables and figures in the paper.

@@ -75,7 +75,6 @@ SMALL = {
         *("render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]", "inspect.legible_min=0"),
     ),
     "run quickstart --out runs/five": _set("pedestrians.num_paths=3"),
-    "bench": ["--workers", "2"],
     "reproduce": ["--pedestrians", "1", "--workers", "1"],
     "distill train": _set(
         *("distill.train.max_steps=2", "distill.train.max_pixels=4096", "distill.train.samples_per_step=2"),

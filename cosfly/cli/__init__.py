@@ -34,14 +34,13 @@ def _root(
     version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log every item.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Log warnings and errors only.")] = False,
-    log_file: Annotated[Path | None, typer.Option("--log-file", help="Append a verbose log to this file.")] = None,
 ) -> None:
     if version:
         typer.echo(f"cosfly {__version__}")
         raise typer.Exit
     from cosfly.runtime.console import set_up_logging
 
-    set_up_logging(logging.DEBUG if verbose else logging.WARNING if quiet else logging.INFO, log_file)
+    set_up_logging(logging.DEBUG if verbose else logging.WARNING if quiet else logging.INFO)
     log.debug("cosfly %s, Python %s, in %s", __version__, sys.version.split()[0], Path.cwd())
 
 

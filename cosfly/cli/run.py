@@ -1,4 +1,4 @@
-"""The commands `cosfly run`, `show`, `list`, `bench`, `reproduce`, `doctor`, `config ...` and `study ...`."""
+"""The commands `cosfly run`, `show`, `reproduce`, `doctor`, `config ...` and `study ...`."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def print_run(run: Path, *, with_settings: bool = False) -> None:
         items = str(stage.tally or "") + " so far" * (stage.state == "begun")
         rows.append((stage.name, stage.state, items, seconds, disk))
     total = sum(stage.size_bytes for stage in summary.stages)
-    typer.echo(f"{run}: {summary.cfg.name}, {summary.progress} stages complete, {size(total)}{summary.held}")
+    typer.echo(f"{run}: {summary.cfg.name}, {summary.progress} stages complete, {size(total)}")
     head = ("stage", "state", "items", "seconds", "on disk")
     options.print_table(head, rows, left=("state", "items"), is_answer=True, **PLAIN)
     differing = changed(summary.cfg) if with_settings else []
@@ -91,59 +91,11 @@ def print_run(run: Path, *, with_settings: bool = False) -> None:
     lines += [f"  {setting.name} = {dump_json(setting.value)}" for setting in differing]
     for folder, count in summary.waiting().items():
         lines.append(f"review   {count} tracks wait for a decision: {how_to_decide(Path(os.path.relpath(folder)))}")
-    if not (summary.is_complete or summary.held):
+    if not summary.is_complete:
         lines.append(f"resume   cosfly run {os.path.relpath(run)}")
     if pages := [os.path.relpath(run / name) for name in PAGES if (run / name).exists()]:  # towns have their own
         lines.append(f"open     {', '.join(pages)}")
     options.print_lines(lines)
-
-
-@options.app.command("list", epilog="cosfly list runs")
-def list_runs(root: Annotated[Path, Argument(metavar="[DIR]", help="Folder with runs.")] = Path("runs")) -> None:
-    """List the runs in a folder: their progress, tracks, captions and size."""
-    from cosfly.pipeline.runs import find_runs, summarize
-    from cosfly.pipeline.runs import in_words as size
-    from cosfly.runtime.errors import CosflyError
-
-    rows = []
-    errors = []
-    for run in find_runs(root):
-        try:
-            summary = summarize(run)
-        except CosflyError as error:
-            errors.append(f"not readable: {error}")
-            continue
-        counts = (str(summary.kept(stage) or "") for stage in ("render", "caption"))
-        source = f"{len(summary.cfg.towns)} towns" if summary.cfg.towns else summary.cfg.maps.source
-        state = summary.held.lstrip(", ")
-        name = os.path.relpath(run, root)
-        rows.append((name, source, summary.progress, *counts, size(summary.size_bytes), state))
-    head = ("run", "map", "stages", "tracks", "captions", "on disk", "")
-    if rows:
-        options.print_table(head, rows, left=("map", "stages", ""), is_answer=True, **PLAIN)
-    options.print_lines(errors if rows else [f"there are no runs in {root}", *errors])
-
-
-@command("cosfly bench runs/first --stage render --workers 1,2 --out bench", "*", "engine address")
-def bench(
-    job: Job,
-    config: Annotated[Path, Argument(metavar="RUN", help="Run directory that is finished up to the stage.")],
-    out: Annotated[Path, Option(help="New folder for bench.json.")],
-    stage: Annotated[str, Option(help="Stage to measure.")] = "render",
-    workers: Annotated[str, Option(help="Numbers of worker processes, such as 1,2,4.")] = "1,2,4",
-) -> None:
-    """Measure a stage with several numbers of workers: the paper's tables of scaling and reliability."""
-    from rich.box import SIMPLE_HEAD
-
-    from cosfly.pipeline import bench as benchmark
-
-    counts = [int(word) if word.isdecimal() else 0 for word in workers.split(",")]
-    if min(counts) < 1:
-        raise typer.BadParameter("pass whole numbers of 1 or more, separated by commas", param_hint="'--workers'")
-    measured = benchmark.run(job.cfg, config, out, stage, counts)
-    for title, (head, *rows) in benchmark.tables(measured).items():  # the widest fits eighty columns
-        options.print_table(head, rows, title, box=SIMPLE_HEAD, padding=0, show_edge=False)
-    typer.echo(out)
 
 
 @command("cosfly reproduce runs/first", "*", f"{WORKERS} resume")

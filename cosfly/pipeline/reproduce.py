@@ -1,7 +1,7 @@
 """`cosfly reproduce`: the paper's tables and figures from one run, next to the paper's own, on one page.
 
-Figures that the run recorded are read from its stages. The others are measured again in folders below `out`: planners,
-TA*'s beam and zoom are stages that resume after a kill; depth, weather and single pictures are computed each time.
+Figures that the run recorded are read from its stages. The others are measured again in folders below `out`: planners
+and zoom are stages that resume after a kill; depth, weather and single pictures are computed each time.
 `paper.yaml` lists the place of each figure, the paper's value, the reason for a difference, and what is not reproduced.
 
 A place says where in the files of a run the figures of a table are stored:
@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import base64
 import logging
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,21 +38,20 @@ import cosfly.pedestrians.stage
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.captions import FIELDS, Caption, read_captions
 from cosfly.formats.segments import FOLLOW
-from cosfly.pipeline import bench as benchmark
 from cosfly.pipeline.runs import summarize
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners import compare
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.config import build, read_yaml
 from cosfly.runtime.errors import InputError, json_type
-from cosfly.runtime.events import read_events
+from cosfly.runtime.events import LOSSES, Event, read_events
 from cosfly.runtime.io import read_bytes, write_bytes
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.json_io import FileFormat, read_object, write_json
 from cosfly.runtime.limits import num_cpus
 from cosfly.runtime.png import read_picture
 from cosfly.runtime.run_dir import Manifest, Resume, read_manifest
-from cosfly.studies import beam, depth, weather, zoom
+from cosfly.studies import depth, weather, zoom
 from cosfly.viz.frame_views import small_jpeg
 from cosfly.viz.gallery import four_panels
 from cosfly.viz.page import page, run_name
@@ -63,6 +63,7 @@ log = logging.getLogger(__name__)
 
 FORMAT = FileFormat("cosfly.reproduction", "1.0")
 STAGES = ("maps", "simplify", "pedestrians", "plan")  # complete in every run that can be compared
+WITH_ITEMS = ("pedestrians", "plan", "render", "inspect", "caption", "release")  # stages with a time per item
 PLANNERS = ("track_astar", "muco", "foresight")  # the first is compared with the others, as in the paper
 LENSES_DEG = (120, 110, 90, 70, 60, 45, 30)  # tab:zoom_conversion
 ZOOM_DEG = (110.0, 90.0, 60.0, 30.0)
@@ -416,7 +417,6 @@ def measure(
     plan = cfg.plan.model_copy(update={"styles": {FOLLOW: 1.0}})
     compared = build(compare.CompareConfig, plan.model_dump() | {"planners": PLANNERS}, "planners")
     compare.run(compared, simplified, paths, out / "compare", **options)
-    beam.run(plan, simplified, paths, out / "beam", **options)
     if "release" in done:
         release_stats(folder / "release/dataset", out / "release")
     if "render" not in done:
@@ -433,18 +433,18 @@ def measure(
 
 def derived_figures(cfg: RunConfig, folder: Path, reader: FigureReader, done: Sequence[str]) -> dict[str, Any]:
     """Return the figures that come from several files, or from none."""
-    manifests = {name: read_manifest(folder / name) for name in benchmark.STAGES if name in done}
+    manifests = {name: read_manifest(folder / name) for name in WITH_ITEMS if name in done}
     lens = RenderConfig(width_px=1280, height_px=720)
     cameras = {str(fov): zoom.camera_of(lens, fov) for fov in LENSES_DEG}
     track_lengths = reader.figures("plan/drone_trace.json:traces.*.metrics.num_points")[0]
     figures: dict[str, Any] = {
         "budget": {name: [m.seconds, m.counts.input, m.seconds / m.counts.input] for name, m in manifests.items()},
-        "watchdog": {name: [*benchmark.watchdog_figures(folder / name)] for name in manifests},
+        "watchdog": {name: watchdog_figures(read_events(folder / name), manifests[name]) for name in manifests},
         "lenses": {fov: [camera.focal_px, camera.focal_35mm_mm] for fov, camera in cameras.items()},
         "samples": [len(windows_of(length, cfg.distill.dual_track)) for length in track_lengths],
     }
     if "render" in manifests:
-        figures["rendering"] = _rendering(folder / "render", manifests["render"])
+        figures["rendering"] = rendering_figures(read_events(folder / "render"), manifests["render"])
     if "render" in manifests and "caption" in manifests:
         caption = _caption_near(folder / "caption/captions.jsonl", reader.derived["sample"])
         if caption is not None:
@@ -452,16 +452,32 @@ def derived_figures(cfg: RunConfig, folder: Path, reader: FigureReader, done: Se
     return figures
 
 
-def _rendering(tree: Path, manifest: Manifest) -> dict[str, list[Any]]:
-    """Return the row of tab:render_scaling of the run's own rendering."""
-    events = read_events(tree)
+def watchdog_figures(events: list[Event], manifest: Manifest) -> list[Any]:
+    """Return the row of tab:watchdog_reliability of a stage: worker processes, restarts, seconds, losses by kind."""
+    counts = Counter(event.event for event in events)
+    losses = {kind: count for kind, count in counts.items() if kind in LOSSES}
+    return [counts["worker_started"] + counts["restarted"], counts["restarted"], manifest.seconds, losses]
+
+
+def rendering_figures(events: list[Event], manifest: Manifest) -> dict[str, list[Any]]:
+    """Return the row of tab:render_scaling of a rendering, from its events and its manifest.
+
+    Frames are attempted if they are finished, or lost with a worker.
+    """
     workers = max((event.workers or 1 for event in events if event.event == "began"), default=1)
-    row = benchmark.bench_run(events, manifest, workers, counts_frames=True)
-    speed_up = 1.0 if row.per_s else None  # against itself
+    done = [event for event in events if event.event == "item_done"]
+    lost = [event for event in events if event.event in LOSSES]
+    probes = [event for event in events if event.event == "probe"]
+    attempted = sum(event.steps or 0 for event in [*done, *lost])
+    successful = sum(event.steps or 0 for event in done if event.status == "kept")
+    cores = round(float(np.mean([probe.cores_used or 0.0 for probe in probes] or [0.0])), 2)
+    peak_mib = max((sum((probe.rss_mib or {}).values()) for probe in probes), default=0.0)
+    restarts = sum(event.event == "restarted" for event in events)
     return {
-        f"{row.workers} workers": [
-            row.seconds, row.attempted, row.successful, row.per_s, speed_up, row.cores_used, row.peak_memory_mib,
-            row.restarts, row.failed, row.gpu_percent, row.gpu_gib,
+        f"{workers} workers": [
+            manifest.seconds, attempted, successful, successful / manifest.seconds,
+            1.0 if successful else None,  # the speed-up against itself
+            cores, peak_mib, restarts, manifest.counts.failed.total(),
         ]
     }  # fmt: skip
 

@@ -69,8 +69,8 @@ class StageResult:
     was_complete: bool
 
 
-def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path | None = None) -> list[Stage]:
-    """Return the stages of a run in order; each works in the folder of its name in the run directory or in `into`."""
+def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[Stage]:
+    """Return the stages of a run in order; each works in the folder of its name in the run directory."""
     seed = cfg.seed
     pool = worker_options(cfg)
     boxes = out / "maps/boxes_3d.json"
@@ -82,7 +82,7 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path 
     sources = [Source.of_files(tree, out / "caption/captions.jsonl", out / "inspect/inspect.json")]
 
     def stage(name: str, run: Callable[..., Path], *inputs: Any, **options: Any) -> Stage:
-        return Stage(name, partial(run, getattr(cfg, name), *inputs, (into or out) / name, resume=resume, **options))
+        return Stage(name, partial(run, getattr(cfg, name), *inputs, out / name, resume=resume, **options))
 
     return [
         stage("maps", cosfly.maps.stage.run, seed=seed, follow_links=cfg.follow_links),
@@ -92,7 +92,7 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path 
         stage("render", cosfly.render.stage.run, boxes, simplified, traces, others=others, seed=seed, **pool),
         stage("inspect", cosfly.inspection.stage.run, simplified, traces, tree, **pool),
         stage("caption", caption.stage.stage.run, tree, seed=seed, **pool),
-        joint_release(cfg, sources, into or out, resume),
+        joint_release(cfg, sources, out, resume),
     ]
 
 

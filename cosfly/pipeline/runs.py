@@ -27,7 +27,7 @@ from cosfly.render.stage import run as draw
 from cosfly.runtime.config import load
 from cosfly.runtime.console import duration
 from cosfly.runtime.errors import EnvironmentMissing, InputError, ResumeError
-from cosfly.runtime.run_dir import StageFolder, Tally, is_held, read_manifest
+from cosfly.runtime.run_dir import StageFolder, Tally, read_manifest
 
 STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")  # of a run, in order
 PAGES = ("viewer.html", "contact_sheet.png", "inspect/report.html", "caption/report.html", "release/dataset/README.md")
@@ -59,7 +59,6 @@ class RunSummary:
     """One run directory."""
 
     cfg: RunConfig
-    held: str  # `, running now` while a process holds the directory, else empty
     stages: list[StageSummary]
 
     @property
@@ -70,14 +69,6 @@ class RunSummary:
     def progress(self) -> str:
         """The number of complete stages: `3 of 8`."""
         return f"{sum(stage.state == 'complete' for stage in self.stages)} of {len(self.stages)}"
-
-    @property
-    def size_bytes(self) -> int:
-        return sum(stage.size_bytes for stage in self.stages)
-
-    def kept(self, stage: str) -> int:
-        """Return the number of items that a stage has accepted in all towns."""
-        return sum(summary.tally.kept for summary in self.stages if summary.folder.name == stage and summary.tally)
 
     def waiting(self) -> dict[Path, int]:
         """Return, for each inspection with tracks that wait for a manual decision, its folder and their number."""
@@ -96,26 +87,14 @@ def summarize(run: Path) -> RunSummary:
             where=run,
             got="no run.yaml in it",
             expected="a directory that `cosfly run` wrote",
-            fix="run `cosfly list DIR` to find run directories below a folder",
+            fix="pass the --out of a `cosfly run`",
         )
     cfg = load(RunConfig, run / "run.yaml")
     names = list(STAGES)
     if cfg.towns:  # one release is made of all towns
         names = [*(f"{town}/{name}" for town in cfg.towns for name in STAGES[:-1]), "release"]
     stages = [_stage(name, run / name) for name in names]
-    return RunSummary(cfg, ", running now" if is_held(run) else "", stages)
-
-
-def find_runs(root: Path, depth: int = 2) -> Iterator[Path]:
-    """Yield the run directories below a folder, sorted by name; the towns of a run are not yielded themselves."""
-    if not root.is_dir():
-        raise InputError("the folder of run directories does not exist", where=root, fix="check the path")
-    if (root / "run.yaml").is_file():
-        yield root
-    elif depth:
-        for path in sorted(root.iterdir()):
-            if path.is_dir() and not path.is_symlink():
-                yield from find_runs(path, depth - 1)
+    return RunSummary(cfg, stages)
 
 
 def _stage(name: str, folder: Path) -> StageSummary:

@@ -232,10 +232,8 @@ def config_file(config: Path | None) -> Path | None:
     names = sorted(path.stem for path in shipped(".").glob("*.yaml") if path.stem != "glossary")
     expected = f"a YAML file, a run directory, or one of {', '.join(names)}"
     if config.is_dir():
-        fix = f"run cosfly list {config} to see the runs in this folder"
-        raise ConfigError(
-            "this folder is not a run directory", where=config, got="no run.yaml in it", expected=expected, fix=fix
-        )
+        got = "no run.yaml in it"
+        raise ConfigError("this folder is not a run directory", where=config, got=got, expected=expected)
     if is_bare:
         raise ConfigError(
             f"there is no configuration of this name{nearest(str(config), names)}", where=config, expected=expected

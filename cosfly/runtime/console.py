@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.text import Text
 
-from cosfly.runtime.errors import StorageError
 from cosfly.runtime.escaping import LONGEST_LOG, for_terminal
 
 
@@ -43,31 +40,13 @@ class _Lines(logging.Handler):
         console.print(self.format(record), soft_wrap=True)
 
 
-class _File(logging.FileHandler):
-    """Writes records to a file. If writing fails, it is reported once, and the command continues without the file."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        return for_terminal(super().format(record), LONGEST_LOG)  # the text may come from a server
-
-    def handleError(self, record: logging.LogRecord) -> None:  # the name of the library
-        logging.getLogger().removeHandler(self)
-        log.warning("no more lines are written to the log file %s: %s", self.baseFilename, sys.exc_info()[1])
-
-
-def set_up_logging(level: int, file: Path | None = None) -> None:
-    """Send log lines of a level to the shared console, and all of them to a file, with times."""
+def set_up_logging(level: int) -> None:
+    """Send log lines of a level to the shared console, with times where it is no terminal."""
     with_time = logging.Formatter("%(asctime)s %(levelname)-8s %(message)s", "%Y-%m-%dT%H:%M:%S%z")
-    handlers: list[logging.Handler] = [_Lines(level)]
-    handlers[0].setFormatter(logging.Formatter("%(levelname)-8s %(message)s") if console.is_terminal else with_time)
-    if file is not None:
-        try:
-            handlers.append(_File(file, encoding="utf-8"))
-        except OSError as error:
-            fix = "choose another --log-file"
-            raise StorageError("the log file cannot be written", where=file, got=error.strerror, fix=fix) from None
-        handlers[1].setFormatter(with_time)
-    logging.basicConfig(handlers=handlers, force=True)
-    set_levels(logging.DEBUG if file is not None else level)
+    handler = _Lines(level)
+    handler.setFormatter(logging.Formatter("%(levelname)-8s %(message)s") if console.is_terminal else with_time)
+    logging.basicConfig(handlers=[handler], force=True)
+    set_levels(level)
 
 
 def set_levels(level: int) -> None:

@@ -1,4 +1,4 @@
-"""`events.jsonl`: a log of the workers of a stage, for people and `cosfly bench`; no stage reads it."""
+"""`events.jsonl`: a log of the workers of a stage, for people and `cosfly reproduce`; no stage reads it."""
 
 from __future__ import annotations
 
@@ -53,8 +53,6 @@ class Event(BaseModel):
     rss_mib: dict[int, float] | None = None
     cores_used: float | None = None
     disk_free_mib: float | None = None
-    gpu_percent: float | None = None
-    gpu_mib: float | None = None
 
 
 class Vitals(NamedTuple):
@@ -101,7 +99,7 @@ class EventLog:
             return
         cores = round(self._used_s / elapsed_s, 2) if elapsed_s else 0.0
         free = shutil.disk_usage(self._folder).free / MEBIBYTE
-        self.write("probe", rss_mib=self._peaks_mib, cores_used=cores, disk_free_mib=round(free, 1), **gpu_use())
+        self.write("probe", rss_mib=self._peaks_mib, cores_used=cores, disk_free_mib=round(free, 1))
         self._peaks_mib = {}
         self._used_s = 0.0
         self._probed_s = now_s
@@ -119,13 +117,7 @@ def read_events(folder: Path) -> list[Event]:
     return events
 
 
-def lost_steps(folder: Path) -> int:
-    """Return the number of steps, such as frames, that were done for items which then failed or lost their worker."""
-    events = read_events(folder)
-    return sum(event.steps or 0 for event in events if event.event in LOSSES or event.status == "failed")
-
-
-# --- processes and devices --------------------------------------------------------------------------------------------
+# --- processes --------------------------------------------------------------------------------------------------------
 
 
 def process_stat(pid: int) -> list[bytes]:
@@ -134,21 +126,3 @@ def process_stat(pid: int) -> list[bytes]:
         return Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
     except OSError:
         return []
-
-
-def gpu_use() -> dict[str, float]:
-    """Return the mean load of this machine's NVIDIA devices and their memory in use; an empty dict without devices."""
-    import pynvml as nvml
-
-    loads = list[float]()
-    used_mib = 0.0
-    with contextlib.suppress(nvml.NVMLError, nvml.NVMLLibraryMismatchError):
-        nvml.nvmlInit()  # a repeated call does nothing
-        for index in range(nvml.nvmlDeviceGetCount()):
-            with contextlib.suppress(nvml.NVMLError):  # a virtual device, or no permission
-                device = nvml.nvmlDeviceGetHandleByIndex(index)
-                used_mib += nvml.nvmlDeviceGetMemoryInfo(device).used / MEBIBYTE
-                loads.append(nvml.nvmlDeviceGetUtilizationRates(device).gpu)
-    if not loads:
-        return {}
-    return {"gpu_percent": round(sum(loads) / len(loads), 1), "gpu_mib": round(used_mib, 1)}

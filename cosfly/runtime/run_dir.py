@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_serializer
 import cosfly
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError, NothingKept, ResumeError, StorageError, VerifyError, counts_text, shown
-from cosfly.runtime.events import EVENTS, lost_steps
+from cosfly.runtime.events import EVENTS
 from cosfly.runtime.io import (
     CHECKSUMS,
     checksum_lines,
@@ -100,18 +100,6 @@ def hold_folder(folder: Path) -> FolderLock:
             fix = "choose an --out on another file system"
             raise StorageError("the file system does not support file locks", where=path.parent, fix=fix) from None
     return lock
-
-
-def is_held(folder: Path) -> bool:
-    """Return whether another process holds a folder now."""
-    try:
-        if (folder / LOCK).is_file():
-            FileLock(folder / LOCK, timeout=0).acquire().lock.release()
-    except Timeout:
-        return True
-    except (OSError, NotImplementedError):
-        pass
-    return False
 
 
 # --- records ----------------------------------------------------------------------------------------------------------
@@ -361,8 +349,6 @@ class StageFolder:
         tally.check()
         if not tally.kept:
             raise self.nothing_kept(tally)
-        if lost := lost_steps(self.path):
-            facts["lost_steps"] = lost
         files = [
             Output(path=str(path.relative_to(self.path)), bytes=path.stat().st_size, sha256=sha256_file(path))
             for path in sorted(outputs)
@@ -373,8 +359,6 @@ class StageFolder:
         if self._lock is not None:
             self._lock.release()
         log.info("%s: %s, %.1f s", self.stage, tally, seconds)
-        if lost:
-            log.info("%s: %d finished steps were lost with workers that died or items that failed", self.stage, lost)
 
     def nothing_kept(
         self, tally: Tally, *, expected: str | None = None, where: Path | None = None, fix: str | None = None

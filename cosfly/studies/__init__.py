@@ -1,1 +1,1 @@
-"""Studies of depth formats, zoom, weather and TA*'s beam on the same frames and trajectories."""
+"""Studies of depth formats, zoom and weather on the same frames and trajectories."""

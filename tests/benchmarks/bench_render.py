@@ -3,7 +3,7 @@
     python tests/benchmarks/bench_render.py --frames 24                    # one process, no workers
 
 1280x720, all files, the synthetic town and the SimWorld city, flights of the default planner. On a
-machine with a GPU the same commands use it (the device is printed); `cosfly bench` measures the stage as it is used.
+machine with a GPU the same commands use it (the device is printed).
 """
 
 import argparse
