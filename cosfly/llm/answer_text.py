@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import unicodedata
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,28 +11,18 @@ from itertools import pairwise
 from cosfly.formats.captions import BY_LETTERS, FIELDS, TOKENS, Coc, Language, Place, fields_in_order
 from cosfly.runtime.model_json import find_object
 
-_DECISION = re.compile(
-    r"""[\s"'`*_<\[({“”‘’「『【《]*(?:[0-9]{1,2}[.)]\s*)?"""
-    r"""(?:(?:option|action|decision|answer|(?:flight|final)[\s_-]?(?:decision|action|answer)|动作|决策|飞行决策)"""
-    r"""["'`*]*\s*[:=]\s*["'`*]*)?"""
-    r"""(?P<action>[a-z]+(?:[\s_-]+[a-z]+)*)(?:\(\))?[\s"'`*_>\])}“”‘’」』】》.,;:!。、]*"""
-)
+_DECISION = re.compile(r"""[\s"'`*]*(?P<action>[a-z]+(?:[\s_-]+[a-z]+)*)[\s"'`*.]*""")
 
 MIN_CHARACTERS = {"critical_components": 20, "reasoning_trace": 30}
 # A Chinese character carries about as much meaning as three Latin letters.
 MIN_CHARACTERS_ZH = {"critical_components": 7, "reasoning_trace": 10}
-MAX_DECISION_CHARACTERS = 100  # of an action token with quotes, numbers or words around it
+MAX_DECISION_CHARACTERS = 100  # of an action token with quotes around it
 MAX_CHARACTERS = {"critical_components": 1200, "reasoning_trace": 1600}  # a server may pad without end
 
 
 def normalize_action(text: str) -> str | None:
-    """Return the action token in any spelling (spaces, hyphens, case, quotes, `Decision:`); None for other text."""
-    if BY_LETTERS.get(text.replace("_", "")) == text:
-        return text
-    if len(text) > MAX_DECISION_CHARACTERS:
-        return None
-    plain = "".join(char for char in unicodedata.normalize("NFKC", text) if unicodedata.category(char) != "Cf")
-    match = _DECISION.fullmatch(plain.lower())
+    """Return the action token in any case, with spaces, hyphens or quotes; None for other text."""
+    match = _DECISION.fullmatch(text.lower()) if len(text) <= MAX_DECISION_CHARACTERS else None
     return BY_LETTERS.get(re.sub(r"[\s_-]", "", match["action"])) if match else None
 
 
@@ -80,8 +69,7 @@ class Parsed:
 
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
-_DOTS = ("...", "…", "⋯", "。。。", "···")  # placeholders of a text
-_LEFT_OUT = re.compile(r"\.{3,}|…+|⋯+|。{3,}|·{3,}")
+_DOTS = ("...", "…", "。。。")  # instead of the beginning or the end of a text
 _SLOT = re.compile(r"\{[^{}]*\}")
 _HAN = re.compile(r"[\u4e00-\u9fff]+")
 _LATIN = re.compile(r"[A-Za-z]{2,}")
@@ -133,17 +121,11 @@ def _problem_of(texts: Mapping[str, str], language: Language) -> str | None:
         if len(text) < min_characters:
             return f"{name}_too_short"
         is_bracketed = (text[0], text[-1]) in (("<", ">"), ("[", "]"))
-        if is_bracketed or (any(map(text.__contains__, _DOTS)) and _is_left_out(text, min_characters)):
+        if is_bracketed or text.startswith(_DOTS) or text.endswith(_DOTS):
             return f"{name}_placeholder"
         if not is_in_script(text, language):
             return f"{name}_wrong_language"
     return None
-
-
-def _is_left_out(text: str, min_characters: int) -> bool:
-    """Return whether dots replace the text, its beginning or its end."""
-    at_an_end = _LEFT_OUT.match(text) or _LEFT_OUT.search(text, len(text) - 3)
-    return at_an_end is not None or len(_LEFT_OUT.sub("", text).strip()) < min_characters
 
 
 def is_in_script(text: str, language: Language) -> bool:
