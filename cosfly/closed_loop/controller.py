@@ -6,19 +6,17 @@ the point ahead of the drone, at hip height, at which it looks when the episode 
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
-from cosfly.closed_loop.settings import Drone
+from cosfly.closed_loop.settings import CONTROLLER_FILE, Drone
 from cosfly.closed_loop.stepper import Moment
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.geometry.axes import look_at, wrap_deg
 from cosfly.geometry.motion import in_axes_of
 from cosfly.runtime.config import Config, build, read_yaml
-from cosfly.runtime.errors import ConfigError
 
 AIM_MOST_M = 100.0  # greatest distance of the aim, for a camera that looks at the horizon
 LEAST_DOWN_DEG = 0.1  # least downward pitch that the aim is computed from
@@ -40,21 +38,10 @@ class Control(Config):
     source: str = Field(min_length=1, description="source of the figures")
 
 
-class ControlTable(Config):
-    """The file of the table."""
-
-    schema_: Literal["cosfly.controller"] = Field(alias="schema", description="format of the file")
-    schema_version: Literal["1.0"] = Field(description="version of the format")
-    actions: dict[str, Control] = Field(min_length=1, description="action -> command")
-
-
-def read_controls(path: Path, tokens: tuple[str, ...]) -> dict[str, Control]:
-    """Read a table and check that it has a row for each token."""
-    controls = build(ControlTable, read_yaml(path), path).actions
-    if missing := [token for token in tokens if token not in controls]:
-        problem = f"the controller table has no command for the decisions {', '.join(missing)}"
-        raise ConfigError(problem, where=path, fix="add an entry for each of these decisions under `actions`")
-    return controls
+def read_controls() -> dict[str, Control]:
+    """Read the table."""
+    rows = read_yaml(CONTROLLER_FILE)
+    return {token: build(Control, row, CONTROLLER_FILE) for token, row in rows.items()}
 
 
 class Controller:

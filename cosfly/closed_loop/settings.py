@@ -78,7 +78,6 @@ class FlyConfig(Config):
     student: str = Field("rules", description=f"source of the decisions: {KINDS}")
     as_student: Path | None = Field(None, description="output of `distill train` or `merge`, whose prompts a URL gets")
     adapter: Path | None = Field(None, description="adapter of `distill train` for transformers:MODEL_DIR")
-    controller: Path | None = Field(None, description="table of commands per decision, instead of controller.yaml")
     lead_frames: int = Field(21, ge=5, le=1000, description="number of planned frames up to that of the first decision")
     answer_limit_s: float = Field(60.0, gt=0, description="time limit of a decision, s; after it, the drone hovers")
     most_late_answers: int = Field(
@@ -114,11 +113,6 @@ class FlyConfig(Config):
         """Number of episodes that a worker flies at once; one with a policy, because a policy has a state."""
         return 1 if self.engine == "policy" else self.side_by_side
 
-    @property
-    def table(self) -> Path:
-        """The file of commands per decision."""
-        return self.controller or CONTROLLER_FILE
-
     @model_validator(mode="after")
     def _is_known(self) -> Self:
         if self.engine not in ENGINES:
@@ -135,5 +129,5 @@ class FlyConfig(Config):
 
     def recorded(self) -> dict[str, Any]:
         """Return the settings on record, without a model's address and the paths of files, which change no result."""
-        paths = {name: "own" if getattr(self, name) else None for name in ("controller", "as_student", "adapter")}
+        paths = {name: "own" if getattr(self, name) else None for name in ("as_student", "adapter")}
         return super().recorded() | {"student": self.engine if self.asks_model else self.student} | paths

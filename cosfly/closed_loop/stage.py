@@ -22,10 +22,9 @@ from caption.schema import CaptionConfig
 from cosfly.closed_loop.controller import Control, Controller, read_controls
 from cosfly.closed_loop.engines import EngineDecision, Observation, open_engine
 from cosfly.closed_loop.measures import score_episodes
-from cosfly.closed_loop.settings import FlyConfig
+from cosfly.closed_loop.settings import CONTROLLER_FILE, FlyConfig
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, Moment, as_drawn
 from cosfly.formats.boxes import read_boxes
-from cosfly.formats.captions import TOKENS
 from cosfly.formats.episodes import (
     SCORE,
     SCORE_FORMAT,
@@ -151,11 +150,10 @@ def run(
             got=f"render.frame_stride={cfg.render.frame_stride}",
             fix="remove the setting render.frame_stride",
         )
-    read_controls(cfg.fly.table, TOKENS)
     common: dict[str, Any] = {"seed": seed, "workers": workers, "watch": watch, "resume": resume}
     inputs = {"boxes": boxes, "simplified": simplified, "paths": paths} | ({"others": others} if others else {})
     stage = StageFolder.open(
-        out, "fly", config=cfg, inputs=inputs, seed=seed, resume=resume, package_files={"controller": cfg.fly.table},
+        out, "fly", config=cfg, inputs=inputs, seed=seed, resume=resume, package_files={"controller": CONTROLLER_FILE},
         begun=(PLAN, TREE),
     )  # fmt: skip
     if not stage.is_complete:
@@ -208,10 +206,10 @@ def make_worker(
     """Open an engine in this process, then a renderer; return the function that flies the episodes of an item."""
     os.environ.setdefault("LP_NUM_THREADS", str(max(1, num_cpus() // num_workers)))
     engine = open_engine(cfg.fly, cfg.caption, cfg.infer, seed, out / ANSWERS)
-    controls = read_controls(cfg.fly.table, TOKENS)
+    controls = read_controls()
     shared = {  # fields of every record
         "student": engine.name, "engine": cfg.fly.engine, "seed": seed, "list_sha256": list_sha256,
-        "controller_sha256": None if cfg.fly.engine == "planner" else sha256_file(cfg.fly.table),
+        "controller_sha256": None if cfg.fly.engine == "planner" else sha256_file(CONTROLLER_FILE),
     }  # fmt: skip
     open_episode = start()
 

@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from cosfly.closed_loop.controller import Controller, read_controls
 from cosfly.closed_loop.policy import STATE_HIGH, STATE_LOW, observe
-from cosfly.closed_loop.settings import CONTROLLER_FILE, Drone
+from cosfly.closed_loop.settings import Drone
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, Moment
 from cosfly.envs import episodes as benchmark
 from cosfly.envs.episodes import SIZE_PX, BenchmarkEpisode, world_of
@@ -91,7 +91,7 @@ class FollowEnv(gymnasium.Env):
         self.towns = tuple(towns)
         self.listed = None if episodes == "train" else benchmark.read_list(f"{task}/{episodes}")[1]
         self.drone = Drone()
-        self._controls = read_controls(CONTROLLER_FILE, TOKENS)
+        self._controls = read_controls()
         low, high = (bound.astype(np.float32) for bound in self.drone.bounds)
         self.action_space = spaces.Discrete(len(TOKENS)) if actions == "decisions" else spaces.Box(low, high)
         width_px, height_px = self.size_px

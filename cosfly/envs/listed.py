@@ -6,6 +6,7 @@ from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
 
+from cosfly.closed_loop.settings import CONTROLLER_FILE
 from cosfly.closed_loop.stage import ClosedLoopConfig, EpisodeOpener, finish_episodes, fly_episodes
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory
 from cosfly.envs import episodes as benchmark
@@ -25,7 +26,7 @@ def run(
 ) -> Path:
     """Fly each episode of a list; write `episodes/` and `score.json`. Return the output directory."""
     task, episodes, digest = benchmark.read_list(cfg.env)
-    files = {"controller": cfg.fly.table, "episodes": benchmark.EPISODES_FILE}
+    files = {"controller": CONTROLLER_FILE, "episodes": benchmark.EPISODES_FILE}
     stage = StageFolder.open(out, "fly", config=cfg, inputs={}, seed=seed, resume=resume, package_files=files)
     if not stage.is_complete:
         flown = [(benchmark.episode_id(*episode), episode, benchmark.NUM_DECISIONS) for episode in episodes]

@@ -30,10 +30,8 @@ from distill.training.settings import TrainConfig
 from release.build.config import ReleaseConfig
 
 TOWN_NAME = re.compile(r"[A-Za-z0-9_-]{1,60}")
-# Words of explanations.
-KINDS = {"integer": "whole number", "number": "number", "string": "text", "boolean": "true or false", "null": "null"}
-BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
-BOUNDS |= {"multipleOf": "a multiple of"}
+# Keywords of JSON Schema that explanations name.
+LIMITS = ("enum", "const", "minimum", "exclusiveMinimum", "maximum", "exclusiveMaximum", "multipleOf", "examples")
 
 
 class DistillConfig(Config):
@@ -141,7 +139,7 @@ class Setting(NamedTuple):
 
     name: str  # with its sections, such as `plan.altitude_max_m`
     value: Any  # can be written as JSON; None for a group
-    kind: str  # the allowed values in words; empty for a group
+    kind: str  # the allowed values in the words of JSON Schema; empty for a group
     meaning: str
 
 
@@ -182,29 +180,17 @@ def _explain(
 
 
 def _kind_of(field: Mapping[str, Any], models: Mapping[str, Any]) -> str:
-    """Return the allowed values in words: `number > 0`, `one of a, b`, `list of: text`, `text, as a, b`."""
+    """Return the allowed values in the words of JSON Schema: `number, exclusiveMinimum 0`, `string, enum a | b`."""
     field = {**models.get(field.get("$ref", "").rpartition("/")[2], {}), **field}
-    kind = field.get("type", "")
-    values = field.get("additionalProperties")  # of a mapping
-    if "anyOf" in field:
-        words = ", or ".join(_kind_of(part, models) for part in field["anyOf"])
-    elif "enum" in field:
-        words = f"one of {', '.join(map(str, field['enum']))}"
-    elif "const" in field:
-        words = str(field["const"])
-    elif kind == "array":
-        parts = field.get("prefixItems") or [field.get("items", {})]
-        words = f"list of: {', '.join(_kind_of(part, models) for part in parts)}"
-    elif kind == "object":
-        words = "mapping of names to: " + (
-            _kind_of(values, models) if isinstance(values, dict) and values else "values"
-        )
-    elif field.get("format") == "path":
-        words = "path"
-    else:
-        bounds = " and ".join(f"{sign} {field[bound]}" for bound, sign in BOUNDS.items() if bound in field)
-        words = f"{KINDS.get(kind, 'value')} {bounds}".strip()
-    return f"{words}, as {', '.join(map(str, field['examples']))}" if "examples" in field else words
+    kind = (
+        field.get("format") or field.get("type") or " or ".join(_kind_of(one, models) for one in field.get("anyOf", []))
+    )
+    members = field.get("prefixItems") or [field.get("items") or field.get("additionalProperties")]
+    if of := [_kind_of(member, models) for member in members if isinstance(member, dict)]:
+        kind += f" of {', '.join(of)}"
+    limits = {name: field[name] for name in LIMITS if name in field}
+    words = (" | ".join(map(str, limit)) if isinstance(limit, list) else limit for limit in limits.values())
+    return ", ".join([kind or "any", *(f"{name} {word}" for name, word in zip(limits, words, strict=True))])
 
 
 def nested(settings: list[Setting]) -> dict[str, Any]:
