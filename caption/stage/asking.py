@@ -20,7 +20,7 @@ from caption.stage.tracks import TrackInput
 from caption.stage.window_loop import caption_window
 from caption.teachers.judge import open_judge
 from caption.teachers.prompt_files import Vocabulary
-from caption.teachers.teacher import Teacher, first_budget, open_teacher
+from caption.teachers.teacher import Teacher, open_teacher
 from cosfly.formats.captions import Caption, Usage, read_captions, write_captions
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook, Budget, BudgetSpent
@@ -88,7 +88,9 @@ class Asking:
         try:
             with AnswerBook(path / ANSWERS) as answers, AnswerBook(path / JUDGEMENTS) as judgements:
                 self.books = (answers, judgements)
-                budget = first_budget(self.cfg, answers.totals, judgements.totals)
+                num_judging = self.cfg.judge.concurrency if self.cfg.judge.url else 0
+                most_in_flight = self.cfg.most_in_flight + num_judging
+                budget = Budget(self.cfg.budget, most_in_flight, answers.totals, judgements.totals)
                 with progress_bar("caption", sum(guesses)) as advance:
                     self.progress = RunProgress(advance, sum(guesses), budget)
                     async with (

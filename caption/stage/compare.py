@@ -21,9 +21,9 @@ from caption.stage.asking import ANSWERS
 from caption.stage.tracks import find_inputs
 from caption.stage.window_loop import WindowLoop
 from caption.teachers.prompt_files import Vocabulary, vocabulary_of
-from caption.teachers.teacher import Teacher, first_budget, open_teacher
+from caption.teachers.teacher import Teacher, open_teacher
 from cosfly.formats.captions import Coc, Verdict
-from cosfly.llm.answers import AnswerBook
+from cosfly.llm.answers import AnswerBook, Budget
 from cosfly.llm.contract import NoAnswer, run_until_interrupted
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.io import refuse_links
@@ -129,7 +129,8 @@ async def _try_all(
     every = itertools.chain.from_iterable(track.windows(cfg) for track in find_inputs(cfg, data)[0])
     windows = (window for window in every if window.problem is None)
     with AnswerBook(out / ANSWERS) as book:  # the first answer is asked for once for all strategies
-        async with open_teacher(cfg, book, seed, first_budget(cfg, book.totals)) as teacher:
+        budget = Budget(cfg.budget, cfg.most_in_flight, book.totals)
+        async with open_teacher(cfg, book, seed, budget) as teacher:
             while len(trials) < most and (batch := list(itertools.islice(windows, cfg.most_in_flight))):
                 num_windows += len(batch)
                 found = await asyncio.gather(*(_try_each(window, teacher, cfg, vocabulary) for window in batch))

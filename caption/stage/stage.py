@@ -136,7 +136,7 @@ def _finish(
     out = stage.path
     if outcome.stopped:
         raise TeacherError(
-            "captioning stopped, because the next request may exceed the budget",
+            "captioning stopped, because the budget is spent",
             where=cfg.teacher,
             got=f"{outcome.stopped}; {tally.kept} windows accepted so far",
             fix="raise --max-cost or --max-tokens and run the same command again; answered windows are not asked again",

@@ -19,9 +19,9 @@ from caption.stage.tracks import find_inputs
 from caption.stage.window_loop import caption_window
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.students import student_settings
-from caption.teachers.teacher import EMBEDDED, AskingTeacher, first_budget, open_teacher
+from caption.teachers.teacher import EMBEDDED, AskingTeacher, open_teacher
 from cosfly.formats.captions import Caption
-from cosfly.llm.answers import AnswerBook
+from cosfly.llm.answers import AnswerBook, Budget
 from cosfly.llm.contract import NoAnswer, Reply, Request, run_until_interrupted
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError, TeacherError
 from cosfly.runtime.escaping import LONGEST_LOG, for_terminal
@@ -54,7 +54,8 @@ def show_windows(
 
     async def ask() -> list[Caption | BaseException]:
         with AnswerBook(out / ANSWERS) as book:
-            async with open_teacher(cfg, book, seed, first_budget(cfg, book.totals)) as teacher:
+            budget = Budget(cfg.budget, cfg.most_in_flight, book.totals)
+            async with open_teacher(cfg, book, seed, budget) as teacher:
                 assert isinstance(teacher, AskingTeacher)
                 teacher.kept.listener = lambda sample_id, *exchange: exchanges[sample_id].append(exchange)
                 asked = [caption_window(window, teacher, cfg, vocabulary) for window in windows]

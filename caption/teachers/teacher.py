@@ -8,7 +8,6 @@ Chinese of an English answer; its complaint says what was wrong with the last on
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import asynccontextmanager
@@ -27,7 +26,7 @@ from caption.teachers.students import TrainedStudent
 from cosfly.formats.captions import TeacherRecord, TeacherSettings
 from cosfly.formats.places import flight_of
 from cosfly.llm.answer_text import answer_schema
-from cosfly.llm.answers import BYTES_PER_TOKEN, PIXELS_PER_TOKEN, AnswerBook, Budget, KeptAnswers
+from cosfly.llm.answers import AnswerBook, Budget, KeptAnswers
 from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Engine, NoAnswer, Reply, Request, started
 from cosfly.llm.student_chat import EncodedImage, encoded_image
@@ -141,17 +140,6 @@ class AskingTeacher:
 
 
 Teacher = RuleTeacher | GivenTeacher | AskingTeacher
-
-
-def first_budget(cfg: CaptionConfig, *counts: Counter[str]) -> Budget:
-    """Return the budget of a run. Until the first answer, a request counts as 16 of the largest pictures and much text.
-
-    Args:
-        counts: `totals` of each answer journal.
-    """
-    pictures = 16 * cfg.image.max_side_px * cfg.image.max_side_px * 9 // 16 // PIXELS_PER_TOKEN
-    first = pictures + 16_000 // BYTES_PER_TOKEN
-    return Budget(cfg.budget, *counts, first_prompt=first, first_completion=cfg.endpoint.max_tokens)
 
 
 def embedded_teacher(cfg: CaptionConfig, seed: int) -> Teacher:

@@ -34,8 +34,8 @@ STUDENT = "Output of `distill train` or `merge`: ask the model in the form that 
     model=MODEL,
     judge=SettingOption("caption.judge.url", "URL of a server that judges conflicts; it never accepts a hard one."),
     limit=SettingOption("caption.limit", "Caption at most this many windows; a later run resumes.", int),
-    max_cost=SettingOption("caption.budget.max_cost", "Stop before this cost; prices: caption.budget.price_*.", float),
-    max_tokens=SettingOption("caption.budget.max_tokens", "Stop before this many tokens, over all runs.", int),
+    max_cost=SettingOption("caption.budget.max_cost", "Stop at this cost; prices: caption.budget.price_*.", float),
+    max_tokens=SettingOption("caption.budget.max_tokens", "Stop at this number of tokens, over all runs.", int),
 )
 def caption(
     job: Job,

@@ -24,7 +24,7 @@ from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.prompts import Question, make_question
 from caption.teachers.rule_decisions import decide
 from caption.teachers.students import student_settings
-from caption.teachers.teacher import first_budget, open_teacher
+from caption.teachers.teacher import open_teacher
 from cosfly.closed_loop.settings import BASELINES, FlyConfig
 from cosfly.closed_loop.stepper import ClosedLoopTrajectory, Moment
 from cosfly.formats.captions import TOKENS
@@ -35,7 +35,7 @@ from cosfly.geometry.axes import wrap_deg
 from cosfly.geometry.motion import in_axes_of
 from cosfly.llm.answer_text import normalize_action, parse_answer
 from cosfly.llm.answers import Answer as BookAnswer
-from cosfly.llm.answers import AnswerBook
+from cosfly.llm.answers import AnswerBook, Budget
 from cosfly.llm.contract import NoAnswer
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE, read_chat_format
 from cosfly.runtime.errors import ConfigError, CosflyError
@@ -156,7 +156,9 @@ class PromptedEngine:
         self._open(cfg, infer, seed)
 
     def _open(self, cfg: FlyConfig, infer: InferConfig, seed: int) -> None:
-        self._opened = open_teacher(self.cfg, self._book, seed, first_budget(self.cfg, self._book.totals))
+        self._opened = open_teacher(
+            self.cfg, self._book, seed, Budget(self.cfg.budget, self.cfg.most_in_flight, self._book.totals)
+        )
         self._teacher = self._runner.run(self._opened.__aenter__())  # open as long as the engine
         self.name = self._teacher.record.model
 

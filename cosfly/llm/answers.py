@@ -34,8 +34,6 @@ from cosfly.runtime.model_json import CONTEXT_FULL, DECLINED
 log = logging.getLogger(__name__)
 
 MOST_NAME_BYTES = 200  # of a file name without its ending; file systems allow 255 with it
-BYTES_PER_TOKEN = 3  # of a prompt; a low estimate keeps the spending within the budget
-PIXELS_PER_TOKEN = 28 * 28  # of common vision encoders
 _PLAIN_NAME = re.compile(r"\w[\w.+-]*")
 
 
@@ -161,8 +159,8 @@ class BudgetConfig(Config):
 
     price_prompt: float = Field(0.0, ge=0, description="price of one million prompt tokens, in your currency")
     price_completion: float = Field(0.0, ge=0, description="price of one million answer tokens, in your currency")
-    max_cost: float | None = Field(None, gt=0, description="stop before this cost is exceeded; empty: no limit")
-    max_tokens: int | None = Field(None, ge=1, description="stop before this many tokens are exceeded; empty: no limit")
+    max_cost: float | None = Field(None, gt=0, description="stop at this cost; empty: no limit")
+    max_tokens: int | None = Field(None, ge=1, description="stop at this number of tokens; empty: no limit")
 
     @model_validator(mode="after")
     def _priced(self) -> Self:
@@ -178,79 +176,50 @@ class BudgetConfig(Config):
 
 
 class BudgetSpent(TeacherError):
-    """The next request might exceed a limit; `what` says which."""
+    """A limit is reached; `what` says which."""
 
 
 class Budget:
-    """The shared budget of several journals of answers.
+    """The shared budget of several journals of answers. It is spent when their sum reaches a limit.
 
-    A request waits until it fits together with all requests in flight, each counted with the largest size so far. If it
-    does not fit alone, the budget is spent.
+    Requests in flight are then finished, so their answers may pass the limit.
     """
 
-    def __init__(self, cfg: BudgetConfig, *counts: Counter[str], first_prompt: int, first_completion: int) -> None:
+    def __init__(self, cfg: BudgetConfig, most_in_flight: int, *counts: Counter[str]) -> None:
         """
         Args:
+            most_in_flight: Number of requests that may pass a limit.
             counts: `AnswerBook.totals` of each journal.
-            first_prompt, first_completion: Assumed tokens of a request until one is answered.
         """
         self.cfg = cfg
         self._counts = counts
-        self._first = (first_prompt, first_completion)
-        self._largest: dict[int, tuple[int, int]] = {}  # prompt and completion tokens by number of pictures
-        self._in_flight = Counter[int]()  # requests by number of pictures
-        self._freed = asyncio.Event()
+        self._slots = asyncio.Semaphore(most_in_flight)
 
     @property
     def totals(self) -> Counter[str]:
         """Answers, prompt_tokens and completion_tokens of all journals."""
         return sum(self._counts, Counter())
 
-    @property
-    def spent(self) -> float:
-        """Cost so far."""
-        totals = self.totals
-        return self.cfg.cost(totals["prompt_tokens"], totals["completion_tokens"])
-
     @contextlib.asynccontextmanager
-    async def request(self, num_pictures: int = 0) -> AsyncIterator[None]:
-        """Reserve the share of one request; raises BudgetSpent if it does not fit."""
-        while (spent := self._exceeded_by_another(num_pictures)) is not None:
-            if not self._in_flight.total():
-                raise spent
-            self._freed.clear()
-            await self._freed.wait()
-        self._in_flight[num_pictures] += 1
-        try:
+    async def request(self) -> AsyncIterator[None]:
+        """Wait for a slot; raises BudgetSpent if a limit is reached."""
+        async with self._slots:
+            totals, cfg = self.totals, self.cfg
+            tokens = totals["prompt_tokens"] + totals["completion_tokens"]
+            cost = cfg.cost(totals["prompt_tokens"], totals["completion_tokens"])
+            used = None
+            if cfg.max_tokens is not None and tokens >= cfg.max_tokens:
+                name, used = "max_tokens", f"{tokens:,} of {cfg.max_tokens:,} tokens are used"
+            elif cfg.max_cost is not None and cost >= cfg.max_cost:
+                name, used = "max_cost", f"{cost:.4f} of {cfg.max_cost:g} is spent"
+            if used is not None:
+                fix = "raise it and run the same command again"
+                raise BudgetSpent(f"the limit is reached: {used}", where=f"budget.{name}", fix=fix)
             yield
-        finally:
-            self._in_flight[num_pictures] -= 1
-            self._freed.set()
 
-    def _exceeded_by_another(self, num_pictures: int) -> BudgetSpent | None:
-        """Return the error of a limit that one more request might exceed; None if it fits."""
-        prompt = completion = 0
-        for pictures, count in (self._in_flight + Counter([num_pictures])).items():
-            largest_prompt, largest_completion = self._largest.get(pictures, self._first)
-            prompt += count * largest_prompt
-            completion += count * largest_completion
-        totals, cfg = self.totals, self.cfg
-        tokens = totals["prompt_tokens"] + totals["completion_tokens"]
-        if cfg.max_tokens is not None and tokens + prompt + completion > cfg.max_tokens:
-            name, used = "max_tokens", f"{tokens:,} of {cfg.max_tokens:,} tokens are used"
-        elif cfg.max_cost is not None and self.spent + cfg.cost(prompt, completion) > cfg.max_cost:
-            name, used = "max_cost", f"{self.spent:.4f} of {cfg.max_cost:g} is spent"
-        else:
-            return None
-        what, fix = f"the next request may exceed the limit: {used}", "raise it and run the same command again"
-        return BudgetSpent(what, where=f"budget.{name}", fix=fix)
-
-    def note(self, usage: Usage | None, where: str, num_pictures: int = 0) -> None:
-        """Record the size of an answered request; raises TeacherError if a limit is set and no usage is reported."""
-        if usage is not None:
-            prompt, completion = self._largest.get(num_pictures, (0, 0))
-            self._largest[num_pictures] = (max(prompt, usage.prompt_tokens), max(completion, usage.completion_tokens))
-        elif self.cfg.max_cost is not None or self.cfg.max_tokens is not None:
+    def check(self, usage: Usage | None, where: str) -> None:
+        """Raise TeacherError if a limit is set and an answer has no usage."""
+        if usage is None and (self.cfg.max_cost is not None or self.cfg.max_tokens is not None):
             raise TeacherError(
                 "the endpoint does not report token usage, so a limit on tokens or cost cannot be applied",
                 where=where,
@@ -289,8 +258,7 @@ class KeptAnswers:
 
     async def _ask_engine(self, request: Request, track: str, key: str, sample_id: str, purpose: str) -> Reply:
         """Ask the engine within the budget, and record its answer before anything is derived from it."""
-        num_pictures = len(request.digests)
-        async with self.budget.request(num_pictures) if self.budget else contextlib.nullcontext():
+        async with self.budget.request() if self.budget else contextlib.nullcontext():
             start_s = time.monotonic()
             reply = await self.engine.answer(request)
             if self.book is not None:
@@ -308,5 +276,5 @@ class KeptAnswers:
                 )
                 await self.book.put(track, answer)
         if self.budget is not None:
-            self.budget.note(reply.usage, self.engine.where, num_pictures)
+            self.budget.check(reply.usage, self.engine.where)
         return reply
