@@ -6,27 +6,21 @@ import contextlib
 import math
 import os
 import shutil
-import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from cosfly.formats.bystanders import BYSTANDERS_FILE
 from cosfly.formats.frames import LEGIBLE_HEIGHT_PX
 from cosfly.formats.inspection import undecided
-from cosfly.formats.pedestrian_paths import read_paths, write_paths
-from cosfly.formats.traces import DroneTrace, read_traces, write_traces
-from cosfly.pipeline.command_settings import worker_options
+from cosfly.formats.traces import read_traces
 from cosfly.pipeline.settings import RunConfig
-from cosfly.planners.stage import run as plan_trajectories
 from cosfly.planners.styles import ROWS
-from cosfly.render.stage import run as draw
 from cosfly.runtime.config import load
 from cosfly.runtime.console import duration
-from cosfly.runtime.errors import EnvironmentMissing, InputError, ResumeError
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.run_dir import StageFolder, Tally, read_manifest
 
 STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")  # of a run, in order
@@ -125,8 +119,7 @@ RATES = {  # stage: unit, seconds per unit, MB per unit
     "caption": ("windows", 4.0 / 804, 7.4 / 804),
     "release": ("frames", 7.8 / 790.7, 1.95),
 }
-# What an estimate makes of each map: pedestrian trajectories, plans of the first ones, and frames of each plan.
-SAMPLED_PEDESTRIANS, SAMPLED_TRAJECTORIES, SAMPLED_FRAMES = 64, 8, 4
+WALK_MPS = 1.0  # progress along the straight line from start to goal, with detours and stops
 PERSON_M, PERSON_DEPTH_M = 1.75, 0.45  # height of a person, and extent in the plane
 SMALL_SHARE = 0.2  # of the time
 
@@ -147,143 +140,51 @@ class StageEstimate:
         return f"{self.count:,} {RATES[self.name.rpartition('/')[2]][0]}"
 
 
-@dataclass(frozen=True)
-class RunSample:
-    """What a run will draw, from a sample of its trajectories.
-
-    frames: Of each accepted trajectory of the sample. scale: Trajectories of the run per trajectory of the sample,
-    weighted by length. frame_bytes: Size of a frame; None if not measured.
-    """
-
-    frames: list[int]
-    frame_bytes: float | None
-    scale: float = 1.0
-
-    def total(self, counts: Iterable[int]) -> int:
-        """Return the sum of a count over the run, given its values for the sample."""
-        return round(self.scale * sum(counts))
-
-
 def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
     """Estimate each stage of a run; with several towns, each stage of each town, and then the release."""
     if not cfg.towns:
-        sample = take_sample(cfg, out)
-        return [*_estimates(cfg, out, sample, STAGES[:-1]), _release(cfg, out, [sample])]
-    rows, samples = list[StageEstimate](), list[RunSample]()
+        frames = num_frames(cfg, out)
+        return [*_estimates(cfg, out, frames), _release(cfg, out, [frames])]
+    rows, town_frames = list[StageEstimate](), list[list[int]]()
     for name, town in cfg.all_towns().items():
-        samples.append(take_sample(town, out / name))
-        town_rows = _estimates(town, out / name, samples[-1], STAGES[:-1])
-        rows += [replace(row, name=f"{name}/{row.name}") for row in town_rows]
-    return [*rows, _release(cfg, out, samples)]
+        town_frames.append(num_frames(town, out / name))
+        rows += [replace(row, name=f"{name}/{row.name}") for row in _estimates(town, out / name, town_frames[-1])]
+    return [*rows, _release(cfg, out, town_frames)]
 
 
-def take_sample(cfg: RunConfig, out: Path) -> RunSample:
-    """Plan the first trajectories of a run without towns in a temporary folder, and draw some of their frames.
-
-    Stages that are complete in `out` are copied. The first pedestrian trajectories of a run do not depend on their
-    number; which styles they get does, so sizes and counts are estimates.
-
-    Raises:
-        EnvironmentMissing: If the map comes from a simulator that does not answer, and `out` has no map.
-        ResumeError: If `out` was made with other settings.
-    """
-    scale = 1.0
-    if _is_complete(out / "render"):
-        return RunSample(_frames(cfg, read_traces(out / "plan/drone_trace.json")), None)
-    with tempfile.TemporaryDirectory(prefix="cosfly-estimate-") as place:
-        scratch = Path(place)
-        is_planned = _is_complete(out / "plan")
-        _prepare(cfg, out, scratch, 4 if is_planned else 3)
-        if not is_planned:
-            scale = _plan_sample(cfg, scratch)
-        traces = read_traces(scratch / "plan/drone_trace.json")
-        frame_bytes = None
-        if cfg.render.backend in ("gl", "pyrender"):  # not a simulator, which may not be there
-            frame_bytes = _draw_sample(cfg, scratch, [trace for trace in traces if trace.drop_reason is None])
-        return RunSample(_frames(cfg, traces), frame_bytes, scale)
+def num_frames(cfg: RunConfig, out: Path) -> list[int]:
+    """Return the number of frames of each trajectory, of the finished plan or from the distances of the settings."""
+    if _is_complete(out / "plan"):
+        traces = read_traces(out / "plan/drone_trace.json")
+        num_points = [len(trace.time_s) for trace in traces if trace.drop_reason is None]
+    else:
+        walking = cfg.pedestrians
+        duration_s = 0.5 * (walking.min_distance_m + walking.max_distance_m) / WALK_MPS
+        num_points = [round(duration_s / walking.dt_s)] * walking.num_paths
+    return [math.ceil(count / cfg.render.frame_stride) for count in num_points]
 
 
-def _frames(cfg: RunConfig, traces: list[DroneTrace]) -> list[int]:
-    """Return the number of frames of each accepted trajectory."""
-    return [math.ceil(len(trace.time_s) / cfg.render.frame_stride) for trace in traces if trace.drop_reason is None]
-
-
-def _prepare(cfg: RunConfig, out: Path, scratch: Path, num_stages: int) -> None:
-    """Run the first stages in a folder with the first pedestrians, or copy what `out` has of them."""
-    from cosfly.pipeline.run import stages  # it imports this module
-
-    if not _is_complete(out / "pedestrians"):
-        num_paths = min(cfg.pedestrians.num_paths, SAMPLED_PEDESTRIANS)
-        cfg = cfg.model_copy(update={"pedestrians": cfg.pedestrians.model_copy(update={"num_paths": num_paths})})
-    for stage in stages(cfg, scratch)[:num_stages]:
-        own = out / stage.name
-        if _is_complete(own):
-            shutil.copytree(own, scratch / stage.name)
-        try:
-            stage.work()
-        except EnvironmentMissing as error:
-            error.fix = f"{error.fix}; or pass the --out of a run that has finished the stage {stage.name}"
-            raise
-        except ResumeError as error:
-            error.where = own
-            raise
-
-
-def _plan_sample(cfg: RunConfig, scratch: Path) -> float:
-    """Plan the first trajectories; return how many times as long those of the whole run are."""
-    pedestrians = read_paths(scratch / "pedestrians/path.json")
-    first = scratch / "sample/path.json"
-    first.parent.mkdir()
-    write_paths(first, pedestrians[:SAMPLED_TRAJECTORIES], {})
-    simplified = scratch / "simplify/step2_simplified.json"
-    plan_trajectories(cfg.plan, simplified, first, scratch / "plan", seed=cfg.seed, **worker_options(cfg))
-    lengths = [len(pedestrian.time_s) for pedestrian in pedestrians]
-    num_made = read_manifest(scratch / "pedestrians").counts.input
-    return cfg.pedestrians.num_paths / num_made * sum(lengths) / sum(lengths[:SAMPLED_TRAJECTORIES])
-
-
-def _draw_sample(cfg: RunConfig, scratch: Path, traces: list[DroneTrace]) -> float:
-    """Draw some frames of the first trajectories; return the mean size of a frame in bytes."""
-    first = scratch / "sample/drone_trace.json"
-    first.parent.mkdir(exist_ok=True)
-    write_traces(first, traces[:SAMPLED_TRAJECTORIES], {})
-    stride = math.ceil(max(len(trace.time_s) for trace in traces) / SAMPLED_FRAMES)
-    few = cfg.render.model_copy(update={"frame_stride": stride, "path_index": None})
-    maps = scratch / "maps/boxes_3d.json", scratch / "simplify/step2_simplified.json"
-    others = scratch / "pedestrians" / BYSTANDERS_FILE if cfg.pedestrians.has_others else None
-    tree = draw(few, *maps, first, scratch / "render", others=others, seed=cfg.seed, **worker_options(cfg))
-    pictures = list(tree.rglob("frames_playback/*/*"))
-    return sum(picture.stat().st_size for picture in pictures) / len({picture.parent for picture in pictures})
-
-
-def _estimates(cfg: RunConfig, out: Path, sample: RunSample, names: tuple[str, ...]) -> Iterator[StageEstimate]:
+def _estimates(cfg: RunConfig, out: Path, frames: list[int]) -> Iterator[StageEstimate]:
     window = cfg.caption.window
     # Number of frames of each trajectory at which a whole window can begin.
-    num_starts = [max(0, count - window.num_frames + 1 - window.future_frames) for count in sample.frames]
-    num_windows = sample.total(math.ceil(count / window.stride) for count in num_starts)
+    num_starts = [max(0, count - window.num_frames + 1 - window.future_frames) for count in frames]
     num_tracks = len(cfg.render.tracks)
     counts = {
         "map": 1,
         "pedestrians": cfg.pedestrians.num_paths,
-        "frames": sample.total(sample.frames) * num_tracks,
-        "windows": num_windows * num_tracks,
+        "frames": sum(frames) * num_tracks,
+        "windows": sum(math.ceil(count / window.stride) for count in num_starts) * num_tracks,
     }
-    for name in names:
-        row = _estimate(name, counts[RATES[name][0]], cfg, out)
-        if name == "render" and sample.frame_bytes is not None:
-            row = replace(row, bytes=row.count * sample.frame_bytes)
-        yield row
+    for name in STAGES[:-1]:
+        yield _estimate(name, counts[RATES[name][0]], cfg, out)
 
 
-def _release(cfg: RunConfig, out: Path, samples: list[RunSample]) -> StageEstimate:
-    """Estimate the release of all towns: the selected frames, whose pictures are as large as those of the trees."""
-    most, num_tracks = cfg.release.num_frames, len(set(cfg.release.tracks) & set(cfg.render.tracks))
-    is_all = cfg.release.selection == "all"
-    counts = [one.total(n if is_all else min(n, most) for n in one.frames) * num_tracks for one in samples]
-    row = _estimate("release", sum(counts), cfg, out)
-    sizes = [count * (sample.frame_bytes or 0.0) for count, sample in zip(counts, samples, strict=True)]
-    is_known = not row.is_done and all(sample.frame_bytes is not None for sample in samples)
-    return replace(row, bytes=sum(sizes)) if is_known else row
+def _release(cfg: RunConfig, out: Path, town_frames: list[list[int]]) -> StageEstimate:
+    """Estimate the release of all towns, which has the selected frames."""
+    most = math.inf if cfg.release.selection == "all" else cfg.release.num_frames
+    num_tracks = len(set(cfg.release.tracks) & set(cfg.render.tracks))
+    count = sum(min(count, most) for frames in town_frames for count in frames) * num_tracks
+    return _estimate("release", int(count), cfg, out)
 
 
 def _estimate(name: str, count: int, cfg: RunConfig, out: Path) -> StageEstimate:
