@@ -313,8 +313,9 @@ def test_a_slow_answer_is_late_once_and_the_next_ones_are_in_time(ask):
     assert [one.answer for one in ask("Slow", slow_at=1)] == ["ok", "late", "ok", "ok", "ok"]
 
 
-def test_a_policy_that_hangs_is_stopped_in_a_line(ask, follow):
-    policy = Policy("own:Never", 0.1, 0, most_late=3)
+def test_a_policy_that_hangs_is_stopped_in_a_line(ask, follow, monkeypatch):
+    monkeypatch.setattr("cosfly.closed_loop.policy.MOST_LATE", 3)
+    policy = Policy("own:Never", 0.1, 0)
     seen = SimpleNamespace(simulation=follow._simulation, moments=[follow._now], episode="a")
     assert [policy.decide([seen])[0].answer for _ in range(2)] == ["late", "late"]
     with pytest.raises(TeacherError, match=r"own:Never: the policy did not answer in time .*fly\.answer_limit_s"):

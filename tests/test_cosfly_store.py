@@ -182,37 +182,19 @@ def test_a_lock_leads_nowhere_else(tmp_path):
     assert (tmp_path / "private").read_text() == "mine"
 
 
-def test_a_stage_writes_through_no_link_in_its_folder(tmp_path):
-    out, private = tmp_path / "out", tmp_path / "private"
-    _open(out)
-    (private / "ORI").mkdir(parents=True)
-    (private / "ORI/mine").write_text("mine")
-    for name in ("items.jsonl", "Town01", "Town01/trajectory_1", "Town01/.x.1.partial", "made.json"):
-        link = out / name
-        link.parent.mkdir(exist_ok=True)
-        link.symlink_to(private)
-        before = sorted(out.rglob("*"))
-        with pytest.raises(StorageError, match=f"{name}.*a link to {private}"):
-            _open(out)
-        assert sorted(out.rglob("*")) == before, "nothing of the folder was touched"
-        link.unlink()
-    assert (private / "ORI/mine").read_text() == "mine"
-
-
-def test_nothing_is_written_in_the_place_of_a_link(tmp_path):
+def test_a_link_is_replaced_and_what_it_points_to_is_kept(tmp_path):
     (tmp_path / "private").mkdir()
     (tmp_path / "private/mine").write_text("mine")
     (tmp_path / "file").symlink_to(tmp_path / "private/mine")
     (tmp_path / "folder").symlink_to(tmp_path / "private")
     partial = tmp_path / f".new.{os.getpid()}.partial"
     partial.symlink_to(tmp_path / "private/mine")
-    with pytest.raises(StorageError, match="a link"):
-        write_bytes(tmp_path / "file", b"other")
-    with pytest.raises(StorageError, match="a link"), store.atomic_folder(tmp_path / "folder"):
+    write_bytes(tmp_path / "file", b"other")
+    with store.atomic_folder(tmp_path / "folder"):
         pass
     write_bytes(tmp_path / "new", b"other")
     assert (tmp_path / "private/mine").read_text() == "mine"
-    assert (tmp_path / "folder").is_symlink()
+    assert not any((tmp_path / name).is_symlink() for name in ("file", "folder", "new"))
 
 
 def test_atomic_folder(tmp_path):

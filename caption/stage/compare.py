@@ -26,7 +26,6 @@ from cosfly.formats.captions import Coc, Verdict
 from cosfly.llm.answers import AnswerBook, Budget
 from cosfly.llm.contract import NoAnswer, run_until_interrupted
 from cosfly.runtime.errors import ConfigError, InputError
-from cosfly.runtime.io import refuse_links
 from cosfly.runtime.json_io import write_json
 
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
@@ -103,7 +102,6 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
         fix = "pass --teacher rules, a URL or vllm:MODEL_DIR"
         raise ConfigError("captions of a file cannot be regenerated", where="--teacher", got=cfg.teacher, fix=fix)
     out.mkdir(parents=True, exist_ok=True)
-    refuse_links(out)
     num_windows, trials = run_until_interrupted(_try_all(cfg, vocabulary_of(cfg), data, out, seed, conflicts))
     if not trials:
         what, fix = "the first answers have no conflict, so there is nothing to compare", "pass another --teacher"

@@ -16,7 +16,7 @@ from string import Template
 from caption.schema import CaptionConfig, TextState
 from cosfly.formats.captions import OWN_PROMPTS
 from cosfly.runtime.errors import ConfigError, InputError, nearest
-from cosfly.runtime.io import read_text, refuse_links, storage_errors, write_bytes
+from cosfly.runtime.io import read_text, storage_errors, write_bytes
 
 log = logging.getLogger(__name__)
 
@@ -110,7 +110,6 @@ def export_prompts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
     """
     with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    refuse_links(folder)
     paths = {folder / f"{name}{SUFFIX}": text for name, text in texts.items()}
     others = [path.name for path, text in paths.items() if path.exists() and read_text(path) != text]
     if others:

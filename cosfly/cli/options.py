@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, cast
 import typer
 from typer import Option
 
-from cosfly.runtime.errors import ConfigError, InputError, counts_text, nearest, plain, shown
+from cosfly.runtime.errors import ConfigError, InputError, counts_text, nearest
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -31,7 +31,7 @@ MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="Map of boxes: 
 Simplified = Annotated[Path, Option(help="Simplified map: step2_simplified.json.")]
 Traces = Annotated[Path, Option(help="Drone trajectories: drone_trace.json.")]
 _TREES_HELP = "Playback tree; repeat it for several."
-Trees = Annotated[list[Path] | None, Option("--data", show_default="render of this run directory", help=_TREES_HELP)]
+Trees = Annotated[list[Path] | None, Option("--data", help=_TREES_HELP)]
 Runs = Annotated[list[Path] | None, typer.Argument(help="Run directories of `cosfly run`, all taken together.")]
 Bystanders = Annotated[Path | None, Option("--others", help="Bystanders: others.json, next to path.json.")]
 
@@ -135,7 +135,7 @@ class Job:
         self.finish(self.call(target, *arguments, **keywords), arguments[-1])
 
     def tree(self, data: list[Path] | None) -> Path:
-        """Return the one playback tree of --data, or that of the current run directory."""
+        """Return the one playback tree of --data."""
         trees = self.trees(data)
         if len(trees) > 1:
             raise InputError(
@@ -147,17 +147,10 @@ class Job:
         return trees[0]
 
     def trees(self, data: list[Path] | None) -> list[Path]:
-        """Return the playback trees of --data, or that of the current run directory."""
-        if data:
-            return data
-        for candidate in (Path("render"), Path()):
-            if (candidate / "manifest.json").exists() and candidate.resolve().name == "render":
-                return [self.cfg.opened(candidate)]
-        raise InputError(
-            "--data is missing, and the current directory is not a run directory",
-            where=Path.cwd(),
-            fix="add --data DIR with the directory of rendered tracks, or change to a run directory",
-        )
+        """Return the playback trees of --data."""
+        if not data:
+            raise InputError("--data is missing", fix="add --data DIR with the directory of rendered tracks")
+        return data
 
     def finish(self, product: Path, out: Path) -> None:
         """Print a stage's product; raise InputError if too many items failed."""
@@ -181,22 +174,6 @@ class Job:
             )
 
 
-class _Root(typer.core.TyperGroup):
-    """The root command; it explains an invalid value of an option without pydantic's prefix, and with the value."""
-
-    def invoke(self, ctx: Any) -> Any:
-        try:
-            return super().invoke(ctx)
-        except typer.BadParameter as error:
-            from pydantic import ValidationError
-
-            if isinstance(error.__cause__, ValidationError):
-                detail = error.__cause__.errors()[0]
-                got = "" if detail["type"] == "value_error" else f", got {shown(detail['input'])}"
-                error.message = f"{plain(error.message)}{got}"
-            raise
-
-
 class StageGroup(typer.core.TyperGroup):
     """The command of a stage, with subcommands that do not need the stage's own options."""
 
@@ -208,7 +185,6 @@ class StageGroup(typer.core.TyperGroup):
 
 
 app = typer.Typer(
-    cls=_Root,
     help="Make data sets from 3D maps that teach a vision-language model to follow a person from the air.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,

@@ -31,7 +31,7 @@ def run(
     """Make a data set from a configuration: run all stages in order. Repeat the command to resume."""
     from cosfly.pipeline import run as pipeline
 
-    out = out or pipeline.begun_run(config, job.cfg) or Path("runs") / job.cfg.name
+    out = out or (config if (config / "run.yaml").is_file() else Path("runs") / job.cfg.name)
     if dry_run:
         pipeline.check_out(out)
         pipeline.check_with_files(job.cfg)
@@ -158,7 +158,7 @@ def config_show(
 
 @options.app.command(epilog="cosfly doctor")
 def doctor(out: Annotated[Path, Option(help="Folder that runs will be written to.")] = Path("runs")) -> None:
-    """Check what works on this machine: GL, GPU, packages, disk. Exit with 1 if the main job cannot run."""
+    """Check what works on this machine: GL, packages, disk. Exit with 1 if the main job cannot run."""
     from cosfly.pipeline.doctor import examine
 
     options.print_checks(examine(out), is_answer=True)

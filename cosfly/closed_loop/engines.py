@@ -87,7 +87,7 @@ def open_engine(cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed
     if cfg.engine == "policy":
         from cosfly.closed_loop.policy import Policy
 
-        return Policy(cfg.student.partition(":")[2], cfg.answer_limit_s, seed, cfg.most_late_answers)
+        return Policy(cfg.student.partition(":")[2], cfg.answer_limit_s, seed)
     kind = LocalEngine if cfg.engine == "transformers" else PromptedEngine
     return kind(cfg, caption, infer, seed, answers)
 

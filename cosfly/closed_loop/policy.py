@@ -28,6 +28,7 @@ from cosfly.geometry.goals import SLOTS, words_of
 from cosfly.geometry.motion import in_axes_of
 from cosfly.runtime.errors import InputError, TeacherError
 
+MOST_LATE = 10  # a policy is stopped after this number of late answers in a row
 STATE = ("forward_mps", "left_mps", "up_mps", "height_m", "yaw_deg", "gimbal_pitch_deg", "time_s")
 STATE_LOW = np.array([-40, -40, -40, -100, -180, -90, 0], dtype=np.float32)
 STATE_HIGH = np.array([40, 40, 40, 1000, 180, 90, 3600], dtype=np.float32)
@@ -53,16 +54,12 @@ class Policy:
 
     num_frames = 1
 
-    def __init__(self, spec: str, limit_s: float, seed: int, most_late: int = 0) -> None:
-        """Create the policy of `spec`, a module:Class that is importable from the working directory.
-
-        most_late: After this number of late answers in a row the policy is stopped; 0: never.
-        """
+    def __init__(self, spec: str, limit_s: float, seed: int) -> None:
+        """Create the policy of `spec`, a module:Class that is importable from the working directory."""
         self.name = spec
         self._limit_s = limit_s
         self._seed = seed
         self._episode = ""
-        self._most_late = most_late
         self._num_late = 0  # in a row
         module, _, name = spec.partition(":")
         sys.path.insert(0, str(Path.cwd()))
@@ -97,12 +94,12 @@ class Policy:
         else:
             decision = decision_of(value, observation.simulation.drone)
         self._num_late = self._num_late + 1 if decision.answer == "late" else 0
-        if self._most_late and self._num_late >= self._most_late:
+        if self._num_late == MOST_LATE:
             raise TeacherError(
                 "the policy did not answer in time and was stopped",
                 where=self.name,
                 got=f"{self._num_late} decisions in a row without an answer in {self._limit_s:g} s",
-                fix="correct the policy, or raise fly.answer_limit_s or fly.most_late_answers",
+                fix="correct the policy, or raise fly.answer_limit_s",
             )
         return replace(decision, answer_s=time.monotonic() - begun_s)
 

@@ -80,9 +80,6 @@ class FlyConfig(Config):
     adapter: Path | None = Field(None, description="adapter of `distill train` for transformers:MODEL_DIR")
     lead_frames: int = Field(21, ge=5, le=1000, description="number of planned frames up to that of the first decision")
     answer_limit_s: float = Field(60.0, gt=0, description="time limit of a decision, s; after it, the drone hovers")
-    most_late_answers: int = Field(
-        10, ge=0, description="a policy is stopped after this number of late answers in a row; 0: never"
-    )
     lost_s: float = Field(
         30.0, ge=0, description="an episode ends after this time without a visible target, s; 0: never"
     )

@@ -6,7 +6,6 @@ import importlib.metadata
 import importlib.util
 import platform
 import shutil
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -28,7 +27,6 @@ OPTIONAL_PACKAGES = {  # name: the purpose, and the packages to install
 }
 FRAMES_PER_GIB = 200  # a 1280x720 frame takes about 5 MB, nearly all of it float32 depth
 LEAST_FREE_GIB = 5
-GPU_QUERY = ("--query-gpu=name,memory.total,driver_version", "--format=csv,noheader")
 
 
 class Check(NamedTuple):
@@ -46,7 +44,6 @@ def examine(folder: Path) -> Iterator[Check]:
     yield Check("machine", "ok", f"{num_cpus()} cores, {memory_gib:.0f} GiB memory")
     yield _check_disk(folder)
     yield _check_gl()
-    yield _check_gpu()
     for name, (purpose, install) in OPTIONAL_PACKAGES.items():
         if importlib.util.find_spec(name) is None:
             yield Check(name, "optional", f"not installed; for {purpose}: pip install {install}")
@@ -74,15 +71,3 @@ def _check_gl() -> Check:
         return Check("GL (renderer)", "missing", str(error))
     renderer.close()
     return Check("GL (renderer)", "ok", renderer.device)
-
-
-def _check_gpu() -> Check:
-    try:
-        done = subprocess.run(["nvidia-smi", *GPU_QUERY], capture_output=True, text=True, timeout=20, check=False)
-    except FileNotFoundError:
-        return Check("GPU", "optional", "nvidia-smi is not installed, so the CPU renders frames and trains students")
-    except subprocess.TimeoutExpired:
-        return Check("GPU", "optional", "nvidia-smi does not answer")
-    if done.returncode != 0:
-        return Check("GPU", "optional", f"nvidia-smi failed: {done.stdout.strip() or done.stderr.strip()}"[:120])
-    return Check("GPU", "ok", "; ".join(done.stdout.strip().splitlines()))

@@ -30,7 +30,7 @@ from cosfly.pipeline.command_settings import worker_options
 from cosfly.pipeline.runs import STAGES
 from cosfly.pipeline.settings import RunConfig, run_checks
 from cosfly.runtime.errors import ConfigError, InputError, ResumeError
-from cosfly.runtime.io import refuse_link, write_bytes
+from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import read_object, validated, write_json
 from cosfly.runtime.run_dir import Manifest, Resume, hold_folder, read_manifest
 from cosfly.viz.gallery import contact_sheet
@@ -116,8 +116,6 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "
         check(cfg)
     if not towns:
         return _run_town(cfg, out, stages(cfg, out, resume=resume)[:num_stages])
-    for name in (*towns, "release"):
-        refuse_link(out / name)
     with _run_directory(cfg, out):
         results = []
         for number, (name, town) in enumerate(towns.items(), 1):
@@ -172,19 +170,6 @@ def check(cfg: RunConfig) -> None:
             )
 
 
-def begun_run(config: Path, cfg: RunConfig) -> Path | None:
-    """Return the run directory that a configuration belongs to; None if it is the configuration of a new run.
-
-    Args:
-        config: A run directory, or a YAML file, which may be the `run.yaml` of a run that has begun.
-    """
-    if (config / "run.yaml").is_file():
-        return config
-    folders = [config.parent, *(config.parent / town for town in cfg.towns)]
-    has_begun = config.name == "run.yaml" and any(any(folder.glob("*/stage.json")) for folder in folders)
-    return config.parent if has_begun else None
-
-
 def check_out(out: Path) -> None:
     """Refuse to make a run in the folder of a stage: its tree would hold a second one."""
     if (out / "stage.json").exists() and not (out / "run.yaml").exists():
@@ -212,8 +197,6 @@ def _check_files(cfg: RunConfig) -> None:
 
 def _run_town(cfg: RunConfig, out: Path, town_stages: list[Stage]) -> list[StageResult]:
     """Run the stages of one town."""
-    for stage in town_stages:
-        refuse_link(out / stage.name)
     with _run_directory(cfg, out):
         results = [_run_stage(stage, out, f"{k}/{len(town_stages)}") for k, stage in enumerate(town_stages, 1)]
         # summary.json is written after the pictures, so they are up to date if it has these very stages.

@@ -271,27 +271,6 @@ def _plain_name(root: Path, name: str) -> str:
     return plain
 
 
-def refuse_link(path: Path) -> None:
-    """Refuse to write to a link, which may lead anywhere."""
-    if path.is_symlink():
-        raise StorageError(
-            "the output path is a symbolic link, and cosfly does not write through links",
-            where=path,
-            got=f"a link to {os.readlink(path)}",
-            fix="replace the link by what it points to; only the folder of --out itself may be a link",
-        )
-
-
-def refuse_links(folder: Path) -> None:
-    """Refuse to write into a folder that contains a link at any depth; the folder itself may be a link."""
-    with os.scandir(folder) as entries:
-        for entry in entries:
-            if entry.is_symlink():
-                refuse_link(Path(entry.path))
-            elif entry.is_dir():
-                refuse_links(Path(entry.path))
-
-
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
@@ -331,13 +310,12 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         partial.mkdir()
         yield partial
         if path.exists():
-            shutil.rmtree(path)
+            _remove(path)
 
 
 @contextlib.contextmanager
 def _renamed(path: Path) -> Iterator[Path]:
     """Remove temporary files of killed processes, yield a temporary name, and rename that file or folder at the end."""
-    refuse_link(path)
     begin, end = f".{path.name}.", ".partial"
     partial = path.with_name(f"{begin}{os.getpid()}{end}")
     with storage_errors(path):

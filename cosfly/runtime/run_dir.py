@@ -32,7 +32,6 @@ from cosfly.runtime.io import (
     files_named,
     inside,
     read_checksums,
-    refuse_links,
     remove_partials,
     sha256_bytes,
     sha256_file,
@@ -313,7 +312,6 @@ class StageFolder:
                 return cls(out, stage, True)
         lock = hold_folder(out)
         try:
-            refuse_links(out)
             _prepare_resume(out, record, resume, (*BEGUN, *begun))
             # Failed items are tried again; the others are in the journal.
             (out / "manifest.json").unlink(missing_ok=True)
@@ -327,7 +325,6 @@ class StageFolder:
     def reopen(self) -> None:
         """Continue a complete stage, which is incomplete then."""
         self._lock = hold_folder(self.path)
-        refuse_links(self.path)
         (self.path / "manifest.json").unlink()
         self.is_complete = False
 
