@@ -192,7 +192,7 @@ def of(one):
 def test_a_flight_that_is_counted_by_hand():
     found = of(flight("1100001101", num_walk_frames=20, ended="left"))  # one loss of 4 frames, one blink
     assert found["in_view"] == 5 / 20
-    assert (found["tracked_frames"], found["lost"], found["reacquired"], found["reacquire_s"]) == (5, 1, 1, 2.0)
+    assert (found["tracked_frames"], found["lost"]) == (5, 1)
     assert (found["kept_s"], found["success"], found["left"], found["crashed"]) == (1.0, 0, 1, 0)
 
 
@@ -209,41 +209,20 @@ def test_success_is_what_stands_in_the_module(seen, more, success):
     assert of(flight(seen, **more))["success"] == success
 
 
-def test_decisions_near_misses_and_failures_are_counted():
+def test_failed_decisions_are_counted():
     answers, actions = ["ok", "late", "ok", "ok", "ok"], ["hover", None, "yaw_left", "yaw_left", "hover"]
-    one = flight("11111", answer=answers, action=actions, clearance_m=[9.0, 2.0, 2.4, 9.0, 1.0], answer_s=[1.0, 3.0])
-    found = of(one)
-    assert found["no_decision"] == 1 / 5
-    assert found["changes_pmin"] == pytest.approx(2 / (5 * 0.5 / 60), rel=1e-3)
-    assert found["near_misses_pmin"] == pytest.approx(2 / (5 * 0.5 / 60), rel=1e-3)
-    assert found["decision_s"] == 2.0
+    one = flight("11111", answer=answers, action=actions)
+    assert of(one)["no_decision"] == 1 / 5
     assert sum(measure_episode(one).answers.values()) == len(one.decisions)
-    crash = of(one.model_copy(update={"ended": "crashed"}))
-    assert crash["near_misses_pmin"] == pytest.approx(1 / (5 * 0.5 / 60), rel=1e-3)  # the last one was no miss
 
 
-def test_even_motion_has_no_jerk_and_a_turn_across_north_none_of_yaw():
-    poses = [(float(i), 0, 20, -43, (170 + 5 * i + 180) % 360 - 180, 0) for i in range(9)]
-    frames = tuple(frame(0.5 * i, "end" if i == 8 else "ok", pose=pose) for i, pose in enumerate(poses))
-    found = of(record(frames=frames, num_walk_frames=8))
-    assert found["jerk_rms_mps3"] == pytest.approx(0, abs=1e-6)
-    assert found["yaw_jerk_rms_degps3"] == pytest.approx(0, abs=1e-6)
-    poses[4] = (5.0, *poses[4][1:])  # one pose is 1 m ahead: third differences 1, -3, 3, -1 of six
-    frames = tuple(frame(0.5 * i, "end" if i == 8 else "ok", pose=pose) for i, pose in enumerate(poses))
-    jerk = of(record(frames=frames, num_walk_frames=8))["jerk_rms_mps3"]
-    assert jerk == pytest.approx(np.sqrt(20 / 6) / 0.5**3, rel=1e-3)
-
-
-def test_a_score_adds_up_is_read_as_written_and_marks_towns_that_were_trained_on(tmp_path):
+def test_a_score_adds_up_and_is_read_as_written(tmp_path):
     flights = [flight("11" * (k + 1), walk=f"path_{k}") for k in range(4)] + [flight("10000", walk="path_9")]
-    score = score_episodes(flights, trained_on=["Town_8"])
+    score = score_episodes(flights)
     assert score.figures["success"].value == 4 / 5
     assert score.figures["in_view"].value == (2 + 4 + 6 + 8 + 1) / (2 + 4 + 6 + 8 + 5)
     assert score.figures["success"].low <= 4 / 5 <= score.figures["success"].high
-    for kind, groups in score.by.items():
-        assert sum(figures["success"].count for figures in groups.values()) == len(flights), kind
-    assert list(score.by["training"]) == ["never trained on"]
-    assert list(score_episodes(flights, trained_on=["Town_7"]).by["training"]) == ["trained on"]
+    assert score.figures["success"].count == len(flights)
     assert set(score.figures) == set(MEASURES)
     write_model(tmp_path / SCORE, score, SCORE_FORMAT)
     assert read_score(tmp_path) == score

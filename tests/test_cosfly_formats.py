@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from tables import each
 
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
-from cosfly.formats.episodes import Episode, EpisodeFrame, PathDifficulty, episode_file, read_episode, write_episode
+from cosfly.formats.episodes import Episode, EpisodeFrame, episode_file, read_episode, write_episode
 from cosfly.formats.frames import PERSON_ID
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths, write_paths
 from cosfly.formats.people import COLORS, FIGURES, GARMENTS, GOAL_TERMS, HAIR, Appearance, Goal, People, read_goal
@@ -145,8 +145,7 @@ def record(answers=("lead", "lead", "ok", "late", "end"), **more) -> Episode:
     frames = tuple(frame(0.5 * i, answer) for i, answer in enumerate(answers))
     told = {"student": "rules-7", "engine": "rules", "town": "Town_7", "map_sha256": "ab" * 32, "walk": "path_00000"}
     told |= {"seed": 7, "dt_s": 0.5, "camera_px": (640, 360), "fov_deg": 90.0, "drone_radius_m": 0.5}
-    style = PathDifficulty(pace="walk", turn_degps=2.0, hidden_share=0.1)
-    told |= {"episode": "path_00000", "style": style, "ended": "lost", "num_walk_frames": 9, "frames": frames}
+    told |= {"episode": "path_00000", "pace": "walk", "ended": "lost", "num_walk_frames": 9, "frames": frames}
     return Episode(**told | more)
 
 

@@ -23,7 +23,7 @@ from cosfly.viz.page import page
 Role = Literal["student", "floor", "ceiling"]
 RANKED_BY = ("success", "in_view")
 HEADLINE = ("success", "in_view", "tracked_frames", "kept_s", "lost", "crashed")
-BOARD_FORMAT = FileFormat("cosfly.leaderboard", "2.0", "leaderboard")
+BOARD_FORMAT = FileFormat("cosfly.leaderboard", "3.0", "leaderboard")
 
 
 class LeaderboardConfig(Config):

@@ -135,7 +135,7 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
             airspace.surroundings.obstacles, np.array([moment.time_s for moment in moments]),
             np.hstack([poses.positions_m, poses.rotations_deg]), poses.targets_m, poses.clearances_m,
             np.array([moment.position_m[2] - moment.height_m for moment in moments]), path_id=item.item_id,
-            planner=f"replanned from frame {i} of {record.student}, round {relabel.round}", pace=record.style.pace,
+            planner=f"replanned from frame {i} of {record.student}, round {relabel.round}", pace=record.pace,
             solver={"source": episode, "frame": i, "student": record.student, "round": relabel.round,
                     "decision": record.frames[i].action},
             part_of=planned.part_of,

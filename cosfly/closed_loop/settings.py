@@ -91,7 +91,6 @@ class FlyConfig(Config):
     )
     side_by_side: int = Field(16, ge=1, le=1024, description="episodes that a worker flies at once, as one batch")
     tree: bool = Field(True, description="render the playback tree of what was flown")
-    trained_on: tuple[str, ...] | None = Field(None, description="towns of the student's training; null: unknown")
     relabel: RelabelConfig = Field(RelabelConfig(), description="settings of `cosfly fly --relabel`")
 
     @property

@@ -30,13 +30,12 @@ from cosfly.formats.episodes import (
     SCORE_FORMAT,
     Episode,
     EpisodeFrame,
-    PathDifficulty,
     episode_file,
     read_episode,
     write_episode,
 )
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
-from cosfly.geometry.axes import headings_of, step_s
+from cosfly.geometry.axes import step_s
 from cosfly.geometry.kernels import BoxIndex, obstacle_index, visibility
 from cosfly.geometry.motion import PlannedMotion
 from cosfly.geometry.trajectory_metrics import trajectory_metrics
@@ -60,7 +59,6 @@ EpisodeOpener = Callable[[Any], ClosedLoopTrajectory]
 PLAN, TRACES, TREE, ANSWERS = "plan", "drone_trace.json", "render", "answers"
 MOST_HANGS = 2  # workers that a policy may hang, in addition to one per finished item
 STEP_S = 60.0  # for drawing a step, and for opening an episode
-HALF_SEEN = 0.5  # of five rays
 
 
 class ClosedLoopConfig(Config):
@@ -129,7 +127,7 @@ class OpenEpisode:
         return Episode(
             **shared, episode=self.episode, town=simulation.airspace.town, map_sha256=simulation.airspace.map_sha256,
             walk=plan.path_id,
-            style=difficulty_of(plan, simulation.num_lead - 1, simulation.airspace.surroundings.obstacles),
+            pace=plan.pace,
             dt_s=simulation.dt_s, camera_px=(camera.width_px, camera.height_px), fov_deg=camera.fov_deg,
             drone_radius_m=simulation.drone.radius_m, ended=simulation.ended, frames=tuple(self.frames),
             num_walk_frames=len(plan.time_s) - simulation.num_lead,
@@ -258,7 +256,7 @@ def finish_episodes(
         flown = [trace_of(read_episode(path), obstacles) for path in files]
         write_traces(stage.path / TRACES, flown, {"student": fly.student, "seed": seed})
         outputs.append(stage.path / TRACES)
-    score = score_episodes(map(read_episode, files), trained_on=fly.trained_on, seed=seed)
+    score = score_episodes(map(read_episode, files), seed=seed)
     write_model(stage.path / SCORE, score, SCORE_FORMAT)
     ended = Counter[str](episode.ended for episode in score.flights)
     decisions = sum(sum(episode.answers.values()) for episode in score.flights)
@@ -301,18 +299,6 @@ def _cut(trace: DroneTrace, cfg: FlyConfig) -> DroneTrace:
     return trace.until(cfg.lead_frames + cfg.most_decisions) if cfg.most_decisions else trace
 
 
-def difficulty_of(plan: DroneTrace, start: int, obstacles: BoxIndex) -> PathDifficulty:
-    """Return how hard a pedestrian trajectory is to follow; the plan contributes only its pose at frame `start`."""
-    headings = headings_of(plan.targets_m, plan.time_s)
-    turn_rad = np.abs(np.diff(np.unwrap(headings))).sum()
-    away = plan.positions_m[start] - plan.targets_m[start]
-    back = np.stack([np.cos(headings), np.sin(headings)], axis=1) * -np.hypot(*away[:2])
-    seen = visibility(obstacles, plan.targets_m + np.column_stack([back, np.full(len(back), away[2])]), plan.targets_m)
-    turn_degps = float(np.degrees(turn_rad) / (plan.time_s[-1] - plan.time_s[0]))
-    hidden_share = round(float((seen < HALF_SEEN).mean()), 4)
-    return PathDifficulty(pace=plan.pace, turn_degps=round(turn_degps, 4), hidden_share=hidden_share)
-
-
 def trace_of(record: Episode, obstacles: BoxIndex) -> DroneTrace:
     """Return a flown episode as a drone trajectory, for `render` and `inspect`."""
     frames = record.frames
@@ -326,7 +312,7 @@ def trace_of(record: Episode, obstacles: BoxIndex) -> DroneTrace:
         path_id=record.walk,
         planner=f"flown by {record.student}",
         solver={"ended": record.ended},
-        pace=record.style.pace,
+        pace=record.pace,
     )
 
 

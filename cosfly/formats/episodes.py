@@ -16,8 +16,8 @@ from pydantic import Field, FiniteFloat, NonNegativeInt, model_validator
 from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
 EPISODES = "episodes"  # folder of the records
-EPISODE_FORMAT = FileFormat("cosfly.episode", "1.0", "episode")
-SCORE, SCORE_FORMAT = "score.json", FileFormat("cosfly.score", "1.0", "score")
+EPISODE_FORMAT = FileFormat("cosfly.episode", "2.0", "episode")
+SCORE, SCORE_FORMAT = "score.json", FileFormat("cosfly.score", "2.0", "score")
 MOST_WORDS = 4000  # characters of an answer that are kept
 
 # lead: a frame of the plan, before the first decision. late: no answer within the limit. unreadable: an answer in
@@ -60,15 +60,6 @@ class EpisodeFrame(Record):
     target_m: _Triple
 
 
-class PathDifficulty(Record):
-    """How hard a pedestrian trajectory is to follow. turn_degps: mean turn. hidden_share: share of frames that hide the
-    target from a drone right behind, at the initial distance and height."""
-
-    pace: str
-    turn_degps: _Least
-    hidden_share: Annotated[FiniteFloat, Field(ge=0, le=1)]
-
-
 class Episode(Record):
     """The record of an episode. episode: its id, unique in a folder. walk: the pedestrian trajectory. list_sha256:
     of the benchmark's list, None for own trajectories. controller_sha256: of the table of commands, None if the student
@@ -81,7 +72,7 @@ class Episode(Record):
     map_sha256: str
     walk: str
     seed: int
-    style: PathDifficulty
+    pace: str  # of the pedestrian
     dt_s: Annotated[FiniteFloat, Field(gt=0)]
     camera_px: tuple[int, int]
     fov_deg: Annotated[FiniteFloat, Field(gt=0, lt=180)]
@@ -140,13 +131,12 @@ class Figure(Record):
 
 
 class EpisodeScore(Record):
-    """The measures of one episode. groups: kind of group (measures.GROUPS) -> group. answers: counts of the student's
+    """The measures of one episode. answers: counts of the student's
     answers. sums: figure -> numerator and denominator."""
 
     episode: str
     town: str
     walk: str  # map and trajectory: episodes of one are correlated
-    groups: dict[str, str]
     ended: Ended
     answers: dict[Answer, NonNegativeInt]
     sums: dict[str, tuple[FiniteFloat, _Least]]
@@ -154,18 +144,15 @@ class EpisodeScore(Record):
 
 class Score(Record):
     """The score of one student. episodes_sha256: of the tasks; only equal ones are comparable. list_sha256: of the
-    published list, None for own trajectories. trained_on: towns, None if unknown. figures: by measures.MEASURES;
-    by: kind of group -> group -> figures."""
+    published list, None for own trajectories. figures: by measures.MEASURES."""
 
     student: str = Field(min_length=1)
     engine: str
     episodes_sha256: str
     list_sha256: str | None = None
-    trained_on: tuple[str, ...] | None = None
     confidence: Annotated[FiniteFloat, Field(gt=0, lt=1)]
     resamples: int = Field(ge=1)
     figures: dict[str, Figure]
-    by: dict[str, dict[str, dict[str, Figure]]]
     flights: tuple[EpisodeScore, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
