@@ -170,18 +170,15 @@ def fly(
         job.run("cosfly.closed_loop.stage", run, map_, simplified or map_, paths, out, others=others)
 
 
-@command("cosfly leaderboard rules=flown0 student=flown1 --out board", common="seed resume")
+@command("cosfly leaderboard rules=flown0 student=flown1 --out board", common="resume")
 def leaderboard(
     job: Job,
     folders: Annotated[list[str], Argument(metavar="[NAME=]DIR...", help="Outputs of `cosfly fly`, by student.")],
     out: options.Out,
-    rounds: Annotated[bool, Option("--rounds", help="The folders are rounds of one student, in order.")] = False,
 ) -> None:
     """Compare students: figures with intervals, floors and a ceiling."""
-    from cosfly.closed_loop.leaderboard import LeaderboardConfig
-
     named_folders = []
     for text in folders:
         name, separator, folder = text.partition("=")
         named_folders.append((name, Path(folder)) if separator else ("", Path(text)))
-    job.run("cosfly.closed_loop.leaderboard", LeaderboardConfig(rounds=rounds), named_folders, out)
+    job.run("cosfly.closed_loop.leaderboard", named_folders, out)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from cosfly.closed_loop.measures import MEASURES, SHARES, figures_of
+from cosfly.closed_loop.measures import MEASURES, SHARES
 from cosfly.closed_loop.settings import BASELINES
 from cosfly.formats.episodes import Figure, Score, read_score
 from cosfly.runtime.config import Config
@@ -17,7 +17,6 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, Record, write_model
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
-from cosfly.runtime.seeding import rng_for
 from cosfly.viz.page import page
 
 Role = Literal["student", "floor", "ceiling"]
@@ -26,19 +25,12 @@ HEADLINE = ("success", "in_view", "tracked_frames", "kept_s", "lost", "crashed")
 BOARD_FORMAT = FileFormat("cosfly.leaderboard", "3.0", "leaderboard")
 
 
-class LeaderboardConfig(Config):
-    """Settings of `cosfly leaderboard`, given as options."""
-
-    rounds: bool = False  # the students are rounds of one student, in order
-
-
 class Standing(Record):
     """One student of a table."""
 
     name: str
     role: Role
     score: Score
-    gain: dict[str, Figure] | None = None  # of a round: the change of its figures since the previous round
 
 
 class StudentTable(Record):
@@ -54,9 +46,7 @@ class Leaderboard(Record):
     tables: tuple[StudentTable, ...]
 
 
-def run(
-    cfg: LeaderboardConfig, folders: Sequence[tuple[str, Path]], out: Path, *, seed: int = 0, resume: Resume = "if-same"
-) -> Path:
+def run(folders: Sequence[tuple[str, Path]], out: Path, *, resume: Resume = "if-same") -> Path:
     """Read named folders of `cosfly fly`; write `leaderboard.json` and `leaderboard.html`, and return the page's path.
 
     Args:
@@ -65,43 +55,39 @@ def run(
     scores = [read_score(folder) for _, folder in folders]
     students = [(name or score.student, score) for (name, _), score in zip(folders, scores, strict=True)]
     inputs = {f"{number}/{name}": folder for number, (name, folder) in enumerate(folders)}
-    stage = StageFolder.open(out, "leaderboard", config=cfg, inputs=inputs, seed=seed, resume=resume)
+    stage = StageFolder.open(out, "leaderboard", config=Config(), inputs=inputs, seed=0, resume=resume)
     path = out / "leaderboard.html"
     record = out / "leaderboard.json"
     if not stage.is_complete:
-        board = Leaderboard(tables=tuple(tables_of(students, cfg, seed)))
+        board = Leaderboard(tables=tuple(tables_of(students)))
         write_model(record, board, BOARD_FORMAT)
         write_bytes(path, page_of(board).encode())
         stage.finish([record, path], Tally(input=len(folders), kept=len(folders)))
     return path
 
 
-def tables_of(students: Sequence[tuple[str, Score]], cfg: LeaderboardConfig, seed: int) -> list[StudentTable]:
-    """Return one table for each set of episodes, sorted by success, or by round."""
+def tables_of(students: Sequence[tuple[str, Score]]) -> list[StudentTable]:
+    """Return one table for each set of episodes, sorted by success."""
     groups: dict[str, list[Standing]] = {}
     for name, score in students:
         group = groups.setdefault(score.episodes_sha256, [])
         if name in (standing.name for standing in group):
             fix = "give each student its own name: NAME=DIR"
             raise InputError("two students in one table have the same name", where="leaderboard", got=name, fix=fix)
-        gain = None
-        if cfg.rounds and group:
-            gain = figures_of(score.flights, rng_for(seed, "leaderboard", "gains"), group[-1].score.flights)
         role: Role = "ceiling" if score.engine == "planner" else "student"
         if score.engine in BASELINES:
             role = "floor"
-        group.append(Standing(name=name, role=role, score=score, gain=gain))
-    if not cfg.rounds:
-        for group in groups.values():
-            group.sort(key=lambda row: [row.score.figures[name].value or 0.0 for name in RANKED_BY], reverse=True)
+        group.append(Standing(name=name, role=role, score=score))
+    for group in groups.values():
+        group.sort(key=lambda row: [row.score.figures[name].value or 0.0 for name in RANKED_BY], reverse=True)
     return [StudentTable(episodes_sha256=digest, standings=tuple(group)) for digest, group in groups.items()]
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
 
 
-def _shown(name: str, figure: Figure, *, signed: bool = False) -> str:
-    return figure.shown(("+" if signed else "") + (".1%" if name in SHARES else ".2f"))
+def _shown(name: str, figure: Figure) -> str:
+    return figure.shown(".1%" if name in SHARES else ".2f")
 
 
 def page_of(board: Leaderboard) -> str:

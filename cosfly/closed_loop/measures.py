@@ -114,17 +114,12 @@ def score_episodes(records: Iterable[Episode], *, seed: int = 0) -> Score:
     )  # fmt: skip
 
 
-def figures_of(
-    measured: Sequence[EpisodeScore], rng: np.random.Generator, before: Sequence[EpisodeScore] | None = None
-) -> dict[str, Figure]:
-    """Return all figures with intervals by bootstrap over pedestrian trajectories; with `before`, their changes."""
+def figures_of(measured: Sequence[EpisodeScore], rng: np.random.Generator) -> dict[str, Figure]:
+    """Return all figures with intervals by bootstrap over pedestrian trajectories."""
     walks = sorted({score.walk for score in measured})
     draws = np.vstack([np.ones(len(walks)), draw_pedestrians(len(walks), RESAMPLES, rng)])  # the first: each once
     drawn = _ratios(draws, measured, walks)
     counts = [sum(score.sums[name][1] > 0 for score in measured) for name in MEASURES]
-    if before is not None:
-        drawn = drawn - _ratios(draws, before, walks)
-        counts = [len(walks)] * len(MEASURES)
     return {
         name: figure_of_draws(float(drawn[0, k]), drawn[1:, k], counts[k], len(walks), CONFIDENCE)
         for k, name in enumerate(MEASURES)

@@ -28,9 +28,9 @@ from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_on
 from cosfly.render import stage as rendering
-from cosfly.runtime.errors import ConfigError, InputError, NoPathError, shown
+from cosfly.runtime.errors import ConfigError, InputError, NoPathError
 from cosfly.runtime.pool import Watch, run_items
-from cosfly.runtime.run_dir import Resume, StageFolder, flattened, read_stage_record
+from cosfly.runtime.run_dir import Resume, StageFolder, read_stage_record
 from cosfly.runtime.worker import Item, Outcome, Work, advance
 
 CAPTIONS = "caption"
@@ -84,15 +84,10 @@ def _seed_of(flown: Path, cfg: ClosedLoopConfig) -> int:
             where=flown,
             fix="fly the student again without --others",
         )
-    was = flattened(begun.config["render"], "render")
-    now = flattened(cfg.recorded()["render"], "render")
-    if changed := [
-        f"{key} was {shown(was.get(key))}, is {shown(value)}" for key, value in now.items() if was.get(key) != value
-    ]:
+    if begun.config["render"] != cfg.recorded()["render"]:
         raise ConfigError(
             "the render settings differ from those of the recorded episodes",
             where=flown,
-            got="; ".join(changed),
             fix="use the render settings that stage.json in this folder records",
         )
     return begun.seed
