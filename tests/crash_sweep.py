@@ -150,7 +150,6 @@ def copy_stage(place: Place, out: Path, stage: str) -> None:
 def lose_release(_: Place, out: Path) -> None:
     """Make of a finished run of towns one of which only the release is left to do."""
     shutil.rmtree(out / "release")
-    (out / "summary.json").unlink()
 
 
 # Commands by name; {out} is what is watched, other braces are SHORT and INPUTS. Several: one after the other in the

@@ -208,7 +208,7 @@ class _Forking:
 
 
 TIMES = re.compile(
-    rb'"(seconds\w*|peak_memory_mb|planning_ms\w*|times_ms|(mean|p50|p95|max)_ms|latency_s|time|at|speed)": ?'
+    rb'"(seconds\w*|planning_ms\w*|times_ms|(mean|p50|p95|max)_ms|latency_s|time|at|speed)": ?'
     rb'(\{[^}]*\}|"[^"]*"|[\d.]+)'
 )
 

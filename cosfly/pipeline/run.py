@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import platform
-import resource
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import BaseModel
 
 import caption.stage.stage
 import cosfly
@@ -31,25 +28,12 @@ from cosfly.pipeline.runs import STAGES
 from cosfly.pipeline.settings import RunConfig, run_checks
 from cosfly.runtime.errors import ConfigError, InputError, ResumeError
 from cosfly.runtime.io import write_bytes
-from cosfly.runtime.json_io import read_object, validated, write_json
 from cosfly.runtime.run_dir import Manifest, Resume, hold_folder, read_manifest
 from cosfly.viz.gallery import contact_sheet
 from cosfly.viz.viewer import run as write_viewer
 from release.build.sources import Source, choose_licence
 
 log = logging.getLogger(__name__)
-
-
-class RunTotals(BaseModel):
-    """`summary.json` of a run: counts and seconds of its stages."""
-
-    stages: list[dict[str, Any]] = []
-    peak_memory_mb: float = 0.0
-
-    @classmethod
-    def of(cls, run: Path) -> RunTotals:
-        path = run / "summary.json"
-        return validated(cls, read_object(path, what="summary"), path) if path.exists() else cls()
 
 
 @dataclass(frozen=True)
@@ -106,7 +90,7 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "
     """Make a data set: read what the configuration names, write one folder per stage below `out`.
 
     With several towns each town has its own run directory below `out`, and one `release` is made of all. Every stage is
-    complete or resumable at any moment. The run ends with `contact_sheet.png`, `viewer.html` and `summary.json`.
+    complete or resumable at any moment. The run ends with `contact_sheet.png` and `viewer.html`.
     """
     out = cfg.opened(out)
     num_stages = STAGES.index(until) + 1
@@ -126,7 +110,6 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "
         if until == "release":
             joint = joint_release(cfg, [Source.of_run(out / name) for name in towns], out, resume)
             results.append(_run_stage(joint, out, "all towns"))
-        _save_summary(results, out)
     return results
 
 
@@ -199,12 +182,12 @@ def _run_town(cfg: RunConfig, out: Path, town_stages: list[Stage]) -> list[Stage
     """Run the stages of one town."""
     with _run_directory(cfg, out):
         results = [_run_stage(stage, out, f"{k}/{len(town_stages)}") for k, stage in enumerate(town_stages, 1)]
-        # summary.json is written after the pictures, so they are up to date if it has these very stages.
-        is_shown = RunTotals.of(out).stages == _rows(results) and (out / "viewer.html").exists()
+        viewer = out / "viewer.html"  # written after the contact sheet
+        finished_ns = [(out / stage.name / "manifest.json").stat().st_mtime_ns for stage in town_stages]
+        is_shown = viewer.exists() and viewer.stat().st_mtime_ns > max(finished_ns)
         if (out / "render/manifest.json").exists() and not is_shown:
             contact_sheet(out / "render", out / "contact_sheet.png")
-            write_viewer(out, out / "viewer.html")
-        _save_summary(results, out)
+            write_viewer(out, viewer)
     return results
 
 
@@ -226,22 +209,3 @@ def _save_run(cfg: RunConfig, out: Path) -> None:
     header = f"# cosfly {cosfly.__version__}, Python {platform.python_version()}, {platform.platform()}\n"
     text = header + yaml.safe_dump(cfg.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
     write_bytes(out / "run.yaml", text.encode())
-
-
-def _rows(results: list[StageResult]) -> list[dict[str, Any]]:
-    return [
-        {
-            "stage": result.stage.name,
-            "counts": result.manifest.counts.model_dump(mode="json"),
-            "seconds": result.manifest.seconds,
-        }
-        for result in results
-    ]
-
-
-def _save_summary(results: list[StageResult], out: Path) -> None:
-    """Write `summary.json`; the peak memory is that of a resumed run if it was larger."""
-    unit = 1024 * 1024 if sys.platform == "darwin" else 1024
-    peak_mb = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / unit
-    peak_mb = round(max(RunTotals.of(out).peak_memory_mb, peak_mb), 1)
-    write_json(out / "summary.json", {"stages": _rows(results), "peak_memory_mb": peak_mb})
