@@ -399,6 +399,10 @@ def _kind_of(row: _Row, cfg: BoxesConfig) -> str:
                     if kind in TYPES:
                         return kind
                     break
+    if not name:
+        own = ", ".join(row.values)[:80] or "none"
+        words = f"maps.boxes.type_column names no property of this feature, which has {own}"
+        raise _Skipped("unmapped_type", words)
     raise _Skipped("unmapped_type", f"there is no type for {column}={name[:40]!r}; maps.boxes.types can name one")
 
 

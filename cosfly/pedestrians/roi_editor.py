@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import json
+import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -25,6 +26,8 @@ from cosfly.runtime.io import read_bytes, read_text, sha256_bytes
 from cosfly.viz.page import page, scripts
 from cosfly.viz.page_server import MOST_BYTES, PageServer
 from cosfly.viz.topview import TopView, draw_map, png_bytes
+
+log = logging.getLogger(__name__)
 
 MOST_SIDE, MOST_CELLS = 16_000, 64_000_000  # what browsers draw on one canvas
 OCCUPIED, MARGIN, UNUSED, FREE = 128, 190, 228, 255  # grey levels of the backdrop
@@ -122,6 +125,7 @@ class Editor:
                 raise InputError(what, where=self.path, fix="restart the editor, which then loads the changed file")
             write_roi(self.path, roi)
             self.digest = sha256_bytes(read_bytes(self.path))
+        log.info("saved %s", self.path)
         return {"figures": figures, "saved": str(self.path)}
 
     def answer(self, name: str, data: bytes) -> bytes:
