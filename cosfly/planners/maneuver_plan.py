@@ -164,15 +164,9 @@ def _is_held(reference: TrackingReference, scenario: Scenario, positions_m: np.n
     return (cosine >= np.cos(np.radians(HELD_DEG))) & is_near
 
 
-def describe_not_held(
-    maneuvers: ManeuverPlan, scenario: Scenario, positions_m: np.ndarray, obstacles: BoxIndex, cfg: PlanConfig
-) -> str:
-    """Describe the worst segment: the requested positions, the planned ones, and what prevented the requested ones."""
-    from cosfly.geometry.kernels import signed_distances, visibility
-
-    targets = scenario.targets_m
+def describe_not_held(maneuvers: ManeuverPlan, scenario: Scenario, positions_m: np.ndarray) -> str:
+    """Describe the segment that is held least: its style, the requested positions and the planned ones."""
     reference = maneuvers.reference
-    requested_m = reference.places_m(targets, scenario.ground_m)
     is_held = _is_held(reference, scenario, positions_m)
     judged = [segment for segment in maneuvers.segments if segment.keeps_sight]
     worst = min(judged, key=lambda segment: is_held[segment.begin : segment.end].mean())
@@ -180,26 +174,15 @@ def describe_not_held(
     not_held = frames[~is_held[frames]]
 
     def medians(positions: np.ndarray) -> str:
-        away = (positions - targets)[not_held]
+        away = (positions - scenario.targets_m)[not_held]
         bearing = np.degrees(_wrapped(np.arctan2(away[:, 1], away[:, 0]) - reference.heading_rad[not_held]))
         up_m = np.median((positions[:, 2] - scenario.ground_m)[not_held])
         apart_m = np.median(np.hypot(away[:, 0], away[:, 1]))
         return f"{up_m:.0f} m up, {apart_m:.0f} m away, at {np.median(bearing):.0f} deg"
 
-    steps_m = np.linalg.norm(np.diff(requested_m, axis=0, prepend=requested_m[:1]), axis=1)
-    safety_m = cfg.safety_distance_m
-    causes = {
-        f"nearer than {safety_m:g} m to a box": signed_distances(obstacles, requested_m, safety_m)[0] < safety_m,
-        "without line of sight": visibility(obstacles, requested_m, targets) == 0,
-        "too fast to reach": steps_m > cfg.speed_max_mps * scenario.dt_s,
-    }
-    shares = {cause: applies[not_held].mean() for cause, applies in causes.items()}
-    prevented = ", ".join(f"{share:.0%} {cause}" for cause, share in shares.items() if share > 0)
-    return (
-        f"{worst.style}, {len(not_held) / len(frames):.0%} of frames {worst.begin} to {worst.end - 1}: "
-        f"requested {medians(requested_m)}; planned {medians(positions_m)} (medians); "
-        f"requested positions: {prevented or 'all possible, but the way to them is not'}"
-    )
+    requested_m = reference.places_m(scenario.targets_m, scenario.ground_m)
+    share = len(not_held) / len(frames)
+    return f"{worst.style}, not held in {share:.0%}: requested {medians(requested_m)}; planned {medians(positions_m)}"
 
 
 # --- mission ----------------------------------------------------------------------------------------------------------

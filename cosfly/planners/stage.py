@@ -201,7 +201,7 @@ def _plan_once(
         path_id=pedestrian.path_id, planner=cfg.planner, time_s=pedestrian.time_s, positions_m=positions,
         rotations_deg=np.degrees(np.stack([pitch, yaw, np.zeros_like(yaw)], axis=1)), targets_m=targets,
         visibility=seen, clearances_m=clearances, metrics=metrics, solver=plan.solver, drop_reason=reason,
-        not_held=describe_not_held(maneuvers, scenario, positions, obstacles, cfg) if reason == NOT_HELD else None,
+        not_held=describe_not_held(maneuvers, scenario, positions) if reason == NOT_HELD else None,
         segments=maneuvers.segments, mission=maneuvers.mission, pace=pedestrian.pace,
     )  # fmt: skip
 

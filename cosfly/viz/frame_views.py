@@ -15,6 +15,7 @@ import numpy as np
 from cosfly.formats.captions import Language
 from cosfly.formats.frames import FILE_NAMES, SKY_DEPTH_M, frame_path, read_depth, read_instance, read_meta, read_rgb
 from cosfly.formats.kinds import KINDS
+from cosfly.runtime.config import read_yaml
 from cosfly.runtime.errors import InputError
 
 View = Literal["rgb", "depth", "segmentation", "middle"]
@@ -30,6 +31,7 @@ DEPTH_RANGE_M = 100.0  # dark end of the pseudo-colour; targets are within a thi
 PEDESTRIAN_RGB = (255, 40, 40)
 NUM_SHADES = 24
 PAGE_JPEG_QUALITY = 72
+_SENTENCES = read_yaml(Path(__file__).parent / "templates/pictures.yaml")  # of prompts
 
 
 @dataclass(frozen=True)
@@ -73,55 +75,12 @@ class Pictures:
         """Return the sentence of a prompt that describes these pictures."""
         count = len(self.views)
         is_tiled = self.layout == "tiled" and len(self.views) > 1
-        sentence = _SENTENCES[language][3 if is_tiled else min(count, 2)]
+        sentence = _SENTENCES["frame"][language][3 if is_tiled else min(count, 2)]
         numbers = {"range": self.depth_range_m, "middle": MIDDLE}
-        words = [_DESCRIPTIONS[language][view].format(**numbers) for view in self.views]
+        words = [_SENTENCES["views"][language][view].format(**numbers) for view in self.views]
         listed = {"en": ", ", "zh": "、"}[language].join(words)
         scale = 2 if "middle" in self.views else int(is_tiled)
-        return sentence.format(count=count, views=listed) + _SCALE[language][scale].format(*self.size_px)
-
-
-_DESCRIPTIONS: dict[Language, dict[View, str]] = {
-    "en": {
-        "rgb": "RGB",
-        "depth": "depth in pseudo-colour (bright is near, black is {range:g} m and beyond)",
-        "segmentation": "segmentation with the pedestrian in red",
-        "middle": "the middle of the frame in colour, 1/{middle:d} of its width and height, enlarged",
-    },
-    "zh": {
-        "rgb": "RGB 图像",
-        "depth": "深度伪彩色图（亮为近，黑为 {range:g} 米及更远）",
-        "segmentation": "分割图（行人标为红色）",
-        "middle": "画面中央（宽、高各 1/{middle:d}）的彩色放大图",
-    },
-}
-# By number of pictures of a frame: none; one; several; several tiled into one.
-_SENTENCES: dict[Language, tuple[str, str, str, str]] = {
-    "en": (
-        "No pictures are given.",
-        "Each frame is given as one picture: {views}.",
-        "Each frame is given as {count} pictures, in this order: {views}.",
-        "Each frame is given as one picture of {count} parts, from left to right: {views}.",
-    ),
-    "zh": (
-        "未提供图像。",
-        "每帧给出一张图像：{views}。",
-        "每帧依次给出 {count} 张图像：{views}。",
-        "每帧给出一张图像，由 {count} 部分从左到右拼成：{views}。",
-    ),
-}
-_SCALE: dict[Language, tuple[str, str, str]] = {
-    "en": (
-        " Pixel values refer to pictures of {} x {} px.",
-        " Pixel values refer to parts of {} x {} px.",
-        " Pixel values refer to a picture of the whole frame of {} x {} px.",
-    ),
-    "zh": (
-        "像素值以 {} × {} 像素的图像为准。",
-        "像素值以 {} × {} 像素的各部分为准。",
-        "像素值以 {} × {} 像素的整帧图像为准。",
-    ),
-}
+        return sentence.format(count=count, views=listed) + _SENTENCES["pixels"][language][scale].format(*self.size_px)
 
 
 def frame_label(number: int) -> str:
