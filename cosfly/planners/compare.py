@@ -49,11 +49,11 @@ SIGHT_AND_SAFETY = (
 FLIGHT = (
     ("length_m", "length, m", 1),
     ("duration_s", "time, s", 1),
-    ("target_distance_mean_m", "distance to target, m", 1),
+    ("target_distance_mean_m", "distance, m", 1),
     ("altitude_mean_m", "altitude, m", 1),
-    ("accel_rms_mps2", "acceleration RMS, m/s2", 3),
-    ("jerk_rms_mps3", "jerk RMS, m/s3", 3),
-    ("smoothness_score", "smoothness score S", 3),
+    ("accel_rms_mps2", "accel., m/s2", 3),
+    ("jerk_rms_mps3", "jerk, m/s3", 3),
+    ("smoothness_score", "S", 3),
 )
 FIGURES = (*SIGHT_AND_SAFETY, *FLIGHT)
 NAMES = [name for name, _, _ in FIGURES]
@@ -340,7 +340,10 @@ def text_tables(product: Path) -> Iterator[TextTable]:
         title_of(planner): [*_figure_cells(figures, FLIGHT), *cells([times[planner]["mean_ms"]], 1)]
         for planner, figures in means.items()
     }
-    yield _table("Flight; means over the trajectories found", [*_titles(FLIGHT), "planning, ms"], rows)
+    title = (
+        "Flight, means over the trajectories found: distance to the target, RMS of acceleration and jerk, smoothness S"
+    )
+    yield _table(title, [*_titles(FLIGHT), "planning, ms"], rows)
 
     by_mean = sorted(comparison["axes"].items(), key=lambda entry: -entry[1]["mean"])
     rows = {title_of(planner): cells(scores[axis] for axis in AXES_AND_MEAN) for planner, scores in by_mean}
@@ -362,7 +365,7 @@ def text_tables(product: Path) -> Iterator[TextTable]:
         group: [str(row["num_planners"]), *_figure_cells(row["figures"], shown)]
         for group, row in comparison["groups"].items()
     }
-    yield _table("Means of groups", ["planners", *_titles(shown)], rows)
+    yield _table("Means of groups of planners", ["planners", *_titles(shown)], rows, of="group")
 
     shown = [column for column in FIGURES if column[0] in PAPER_DELTAS]
     rows = {
@@ -377,8 +380,8 @@ def text_tables(product: Path) -> Iterator[TextTable]:
     yield _table(f"{first} better than another planner", names, rows)
 
 
-def _table(title: str, columns: list[str], rows: dict[str, list[str]]) -> TextTable:
-    return TextTable(title, ["planner", *columns], [[name, *row] for name, row in rows.items()])
+def _table(title: str, columns: list[str], rows: dict[str, list[str]], of: str = "planner") -> TextTable:
+    return TextTable(title, [of, *columns], [[name, *row] for name, row in rows.items()])
 
 
 def _titles(figures: Sequence[FigureColumn]) -> list[str]:
