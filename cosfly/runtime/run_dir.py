@@ -381,7 +381,7 @@ def _prepare_resume(out: Path, record: StageRecord, resume: Resume, begun: Colle
     if not (out / "stage.json").exists():
         # A kill during the write of the record leaves its partial file.
         if any(entry.name != LOCK and not entry.match(".stage.json.*.partial") for entry in out.iterdir()):
-            problem = "the output folder contains files that cosfly did not write"
+            problem = "the output directory contains files that cosfly did not write"
             raise ResumeError(problem, where=out, fix="choose an empty --out")
     elif _holds_work(out, begun):
         _check_same(out, record, resume)
