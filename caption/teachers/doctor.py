@@ -142,7 +142,7 @@ class _Examination:
     async def _try_schema(self) -> None:
         plain = "so answers are parsed from plain text"
         if not self.cfg.endpoint.json_schema:
-            self._add("JSON schema", "ok", f"switched off (endpoint.json_schema=false), {plain}")
+            self._add("JSON schema", "ok", f"switched off (caption.endpoint.json_schema=false), {plain}")
             return
         reply = await self._ask([_user("Hello! How are you today?")], 256, ODD_SCHEMA)
         if refusal := self.client.left_out.get("schema"):

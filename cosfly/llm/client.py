@@ -215,7 +215,7 @@ class ChatClient:
         num_at_once = int(self.concurrency.limit)
         if not is_quick and num_at_once < self.cfg.concurrency:
             limit = f"at most {num_at_once} requests are sent at once until answers take less than a third of "
-            limit += "endpoint.timeout_s; raise it if the server can answer more requests at once"
+            limit += "caption.endpoint.timeout_s; raise it if the server can answer more requests at once"
             self._tell_once("slow", logging.INFO, f"an answer took {seconds:.0f} s, so {limit}")
         self._watch_prompts(reply, request)
         return self._with_full_context(reply, request)
