@@ -9,6 +9,7 @@ The endpoint's doctor against servers with one defect each.
 
 import gzip
 import json
+import re
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -470,6 +471,7 @@ def test_a_slow_answer_to_the_largest_prompt_is_no_matter_of_the_context():
     assert list(findings) == ["model", "answers", "thinking", "JSON schema", "speed"]
     assert findings["speed"].state == "unusable"
     assert "caption.endpoint.timeout_s=6" in findings["speed"].detail
+    assert re.search(r"At [\d.]+ tokens/s, as in the first answer, 1024 tokens .* take \d+ s", findings["speed"].detail)
 
 
 def test_an_examination_without_pictures():

@@ -3,6 +3,7 @@
 import json
 import resource
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -134,7 +135,7 @@ def test_a_training_set_is_not_made_of_a_release(run):
         RunSource.of_run(run / "release")
 
 
-DISK_BYTES = 5_000  # the largest file that the system permits
+DISK_BYTES = 1_000  # the largest file that the system permits
 
 
 @pytest.fixture(scope="module")
@@ -167,12 +168,14 @@ def test_what_is_not_a_release_is_refused(whole_release, tmp_path, format):
 @contextmanager
 def full_disk() -> Iterator[None]:
     """Limit the size of files: the system cuts the write that exceeds it, as on a full disk."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    limits, writes_bytecode = resource.getrlimit(resource.RLIMIT_FSIZE), sys.dont_write_bytecode
+    sys.dont_write_bytecode = True  # a module imported here would leave a cut file in __pycache__
     resource.setrlimit(resource.RLIMIT_FSIZE, (DISK_BYTES, limits[1]))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        sys.dont_write_bytecode = writes_bytecode
 
 
 @pytest.mark.parametrize("format", EXPORTS)

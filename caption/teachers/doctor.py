@@ -83,6 +83,7 @@ class _Examination:
     advance: Advance
     most_requests: int | None
     num_requests: int = 0
+    tokens_per_s: float | None = None  # of the first answer; None: not reported
     findings: list[Finding] = field(default_factory=list)
 
     async def run(self) -> list[Finding]:
@@ -133,6 +134,8 @@ class _Examination:
             self._add("answers", "unusable", problem or "")
             return False
         text = reply.text.strip()
+        if reply.usage is not None and reply.usage.completion_tokens:
+            self.tokens_per_s = reply.usage.completion_tokens / seconds
         self._add("answers", "ok", f"{text[:40]!r} after {seconds:.1f} s")
         is_off = not reply.num_thoughts and "<think" not in text
         fix = f"the model thinks before it answers; switch thinking off with {NO_THINKING}"
@@ -189,8 +192,13 @@ class _Examination:
         reply = await self._ask(self.largest, limit, answer_schema(more=THEREFORE))
         seconds = time.monotonic() - start_s
         if isinstance(reply, str):
-            name = "speed" if seconds >= self.cfg.endpoint.timeout_s else "context length"
-            self._add(name, "unusable", f"the largest prompt gets no answer: {reply}")
+            is_slow = seconds >= self.cfg.endpoint.timeout_s
+            if is_slow and self.tokens_per_s:
+                reply += f". At {self.tokens_per_s:.1f} tokens/s, as in the first answer, {limit} tokens "
+                reply += f"(caption.endpoint.max_tokens) take {limit / self.tokens_per_s:.0f} s"
+            self._add(
+                "speed" if is_slow else "context length", "unusable", f"the largest prompt gets no answer: {reply}"
+            )
             return
         used, known = _prompt_tokens(reply), f" of the context of {context}" if context else ""
         detail = f"{used or 'unknown'} tokens of the largest prompt and {limit} for the answer"

@@ -238,7 +238,10 @@ def command(
             if "town" in listed:
                 cfg = _town_of(cfg, values["town"])
             job = Job(cfg, values.get("resume", "if-same"), settings)
-            function(job, **{name: _opened(cfg, values[name]) for name in own_names})
+            try:
+                function(job, **{name: _opened(cfg, values[name]) for name in own_names})
+            except EOFError as error:  # click would print "Aborted." alone
+                raise RuntimeError("a file ends too early") from error
 
         called.__signature__ = Signature([  # type: ignore[attr-defined]
             Parameter("context", Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context),

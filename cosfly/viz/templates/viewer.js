@@ -96,7 +96,7 @@ function drawLead() {
   const frames = data.flights.reduce((sum, flight) => sum + flight.num_frames, 0);
   const captions = data.flights.reduce((sum, flight) => sum + flight.num_captions, 0);
   byId("lead").textContent = `${data.flights.length} tracks with ${frames.toLocaleString("en")} frames and ` +
-    `${captions.toLocaleString("en")} captions; ${samples.length.toLocaleString("en")} frames are shown here. Keys: \u2190 \u2192 frame, \u2191 \u2193 track.`;
+    `${captions.toLocaleString("en")} windows; ${samples.length.toLocaleString("en")} frames are shown here. Keys: \u2190 \u2192 frame, \u2191 \u2193 track.`;
 }
 
 function drawFlights() {
