@@ -6,7 +6,7 @@ All of it is in release.json, which `release verify` compares with the rows. The
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from statistics import fmean
 from typing import Literal
@@ -26,13 +26,17 @@ from release.record import RECORD, Numbers, ReleaseRecord, Spread, read_record, 
 Cell = str | int | float | None
 Rows = list[list[Cell]]
 Plot = Literal["bars", "heat"]
-OF_THEIR_OWN = ("decision", "label", "verdict", "repair_strategy")  # columns of captions that have a table
+WITH_TABLE = ("decision", "label", "verdict", "repair_strategy")  # columns of captions that have a table of their own
 VERDICTS = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
 
 
 class Table(Record):
-    """One table. paper: The label of the paper's. rows: As long as `head`. plot: How a page draws it: the second column
-    as bars, or the numbers of a row and column of names as heat."""
+    """One table of a release.
+
+    paper: Labels of the tables, figures or sections of the paper that it corresponds to; None: of none.
+    rows: Each as long as `head`.
+    plot: How a page draws it: the second column as bars, or all numbers but the first column as a heat map.
+    """
 
     key: str
     title: str
@@ -43,24 +47,8 @@ class Table(Record):
     plot: Plot | None = None
 
 
-SPREAD = "mean|std|least|most|values"
-SHAPES: dict[str, tuple[str, str, str, Plot | None]] = {  # of each table: title, of the paper, head, how it is drawn
-    "release": ("The release", "sec:dataset_stats, sec:exp_release", "|number", None),
-    "quality_stats": ("From plan to release", "tab:quality_stats", "|number", None),
-    "dist_stats": ("Tracks and trajectories", "tab:dist_stats", f"axis|{SPREAD}", None),
-    "fovs": ("Fields of view", "tab:zoom_config, sec:exp_release", "degrees|tracks|frames|level", "bars"),
-    "weather": ("Weather and time of day", "tab:weather_coverage", "preset", "heat"),
-    "augmentation_states": ("Perturbation", "tab:augmentation_states", "state|frames|%", "bars"),
-    "events": ("Outcome of each perturbation", "sec:exp_render, app:dual_track", "track|event|outcome|frames", None),
-    "actions": ("Actions", "", "class|frames|%", "bars"),
-    "decisions": ("Decisions", "tab:coc_actions", "action|decisions|%|labels|% |group", "bars"),
-    "confusion": ("Label (rows) against decision (columns)", "fig:confusion_patterns", "label", "heat"),
-    "verdicts": ("Decision against the geometry", "fig:consistency_verdict", "verdict|captions|%", "bars"),
-    "repairs": ("Repairs", "fig:regen_strategy", "strategy|captions|%", "bars"),
-    "origin": ("Origin of the captions", "tab:caption_pipeline", "||number", None),
-    "text_lengths": ("Length of the texts", "fig:coc_lengths", f"text|{SPREAD}|floor", None),
-}  # fmt: skip
-SPREADS = {
+SPREAD = ["mean", "std", "least", "most", "values"]  # the columns of `_spread`, after its title
+SPREADS = {  # of the record: their titles
     "track_frames": "frames per track",
     "track_duration_s": "duration of a track, s",
     "trajectory_length_m": "length of a trajectory, m",
@@ -74,49 +62,57 @@ SPREADS = {
     "distance_m": "distance to the target, of a frame, m",
     "visibility": "rendered visibility of the target, of a frame",
 }
-NOTES = {
-    "dist_stats": "Of trajectories without perturbation: of the clean track, or the perturbed one minus its offsets.",
-    "weather": "Frames. The presets of the paper are all listed.",
-    "augmentation_states": "Frames of perturbed tracks by their recorded offsets, after fallbacks.",
-    "actions": "Frames by their column action, of the planned motion: the greatest velocity until the next frame; "
-    "below 0.3 m/s a turn of at least 5 degrees/s, else hover.",
-    "verdicts": "Of accepted captions, after repair; the figure of the paper shows first answers, before repair.",
-    "origin": "Values of slots are filled in from the measured facts, those of prose are compared with them: a "
-    "number that equals a fact of its unit is matched (it may be the wrong quantity), one that equals none is "
-    "contradicted. Words without numbers are not checked. Asks, tokens and teachers: of all captions that were read.",
-    "text_lengths": "Characters. The last column is the smallest accepted length.",
-}
+ORIGIN_NOTE = (
+    "Values of slots are filled in from the measured facts, those of prose are compared with them: a number that "
+    "equals a fact of its unit is matched (it may be the wrong quantity), one that equals none is contradicted. Words "
+    "without numbers are not checked. Asks, tokens and teachers: of all captions that were read."
+)
 
 
 def tables_of(record: ReleaseRecord) -> list[Table]:
     """Return the tables of a release; those without rows are skipped."""
+    return [table for table in all_tables(record) if table.rows]
+
+
+def all_tables(record: ReleaseRecord) -> list[Table]:
+    """Return all tables in the order of the card, also those without rows."""
     numbers = record.numbers
-    times = [*TIMES, *sorted({sky.partition(TAB)[2] for sky in numbers.of("sky")} - {*TIMES})]
-    found = {name for pair in numbers.of("confusion") for name in pair.split(TAB)}
-    order = [name for name in (*TOKENS, "none") if name in found]
-    repairs = numbers.of("repair_strategy")
-    rows: dict[str, Rows] = {
-        "release": _release(record), "quality_stats": _quality(record), "dist_stats": _dist(record),
-        "fovs": _fovs(numbers), "weather": _weather(numbers, times),
-        "augmentation_states": _shares(numbers, "states", STATES),
-        "events": [
-            [*(event + 2 * TAB).split(TAB)[:3], count] for event, count in sorted(numbers.of("events").items())
-        ],
-        "actions": _shares(numbers, "action", ACTION_CLASSES),
-        "decisions": _decisions(numbers),
-        "confusion": [[own, *(numbers.of("confusion")[f"{own}{TAB}{other}"] for other in order)] for own in order],
-        "verdicts": _shares(numbers, "verdict", VERDICTS), "repairs": _shares(numbers, "repair_strategy", repairs),
-        "origin": _origin(record), "text_lengths": _lengths(numbers),
-    }  # fmt: skip
-    more = {"weather": times, "confusion": order}
-    return [_table(key, own, more.get(key, [])) for key, own in rows.items() if own]
-
-
-def _table(key: str, rows: Rows, more: list[str]) -> Table:
-    """Return a table by its shape. more: Of its head, after that of the shape."""
-    title, paper, head, plot = SHAPES[key]
-    heads = [*head.split("|"), *more]
-    return Table(key=key, title=title, head=heads, rows=rows, paper=paper or None, note=NOTES.get(key, ""), plot=plot)
+    times, tokens, repairs = _times_of_day(numbers), _confused_tokens(numbers), numbers.of("repair_strategy")
+    return [
+        Table(key="release", title="The release", paper="sec:dataset_stats, sec:exp_release", head=["", "number"],
+              rows=[*_size_rows(record), *_frame_rows(record), *_captioned_frame_rows(record)]),
+        Table(key="quality_stats", title="From plan to release", paper="tab:quality_stats", head=["", "number"],
+              rows=[*_planned_rows(record), *_track_rows(record), *_read_caption_rows(record)]),
+        Table(key="dist_stats", title="Tracks and trajectories", paper="tab:dist_stats", head=["axis", *SPREAD],
+              rows=[_spread(title, numbers.spreads.get(name, Spread())) for name, title in SPREADS.items()],
+              note="Of trajectories without perturbation: of the clean track, or the perturbed one minus its offsets."),
+        Table(key="fovs", title="Fields of view", paper="tab:zoom_config, sec:exp_release",
+              head=["degrees", "tracks", "frames", "level"], rows=_fovs(numbers), plot="bars"),
+        Table(key="weather", title="Weather and time of day", paper="tab:weather_coverage", head=["preset", *times],
+              rows=_weather(numbers, times), plot="heat", note="Frames. The presets of the paper are all listed."),
+        Table(key="augmentation_states", title="Perturbation", paper="tab:augmentation_states", plot="bars",
+              head=["state", "frames", "%"], rows=_shares(numbers, "states", STATES),
+              note="Frames of perturbed tracks by their recorded offsets, after fallbacks."),
+        Table(key="events", title="Outcome of each perturbation", paper="sec:exp_render, app:dual_track",
+              head=["track", "event", "outcome", "frames"], rows=_events(numbers)),
+        Table(key="actions", title="Actions", plot="bars",
+              head=["class", "frames", "%"], rows=_shares(numbers, "action", ACTION_CLASSES),
+              note="Frames by their column action, of the planned motion: the greatest velocity until the next frame; "
+              "below 0.3 m/s a turn of at least 5 degrees/s, else hover."),
+        Table(key="decisions", title="Decisions", paper="tab:coc_actions", plot="bars", rows=_decisions(numbers),
+              head=["action", "decisions", "%", "labels", "% ", "group"]),  # "% ": no two columns have one name
+        Table(key="confusion", title="Label (rows) against decision (columns)", paper="fig:confusion_patterns",
+              head=["label", *tokens], rows=_confusion(numbers, tokens), plot="heat"),
+        Table(key="verdicts", title="Decision against the geometry", paper="fig:consistency_verdict", plot="bars",
+              head=["verdict", "captions", "%"], rows=_shares(numbers, "verdict", VERDICTS),
+              note="Of accepted captions, after repair; the figure of the paper shows first answers, before repair."),
+        Table(key="repairs", title="Repairs", paper="fig:regen_strategy", plot="bars",
+              head=["strategy", "captions", "%"], rows=_shares(numbers, "repair_strategy", repairs)),
+        Table(key="origin", title="Origin of the captions", paper="tab:caption_pipeline", head=["", "", "number"],
+              rows=_origin(record), note=ORIGIN_NOTE),
+        Table(key="text_lengths", title="Length of the texts", paper="fig:coc_lengths", head=["text", *SPREAD, "floor"],
+              rows=_text_lengths(numbers), note="Characters. The last column is the smallest accepted length."),
+    ]  # fmt: skip
 
 
 def percent(count: int, total: int) -> float | None:
@@ -124,91 +120,115 @@ def percent(count: int, total: int) -> float | None:
     return round(100.0 * count / total, 2) if total else None
 
 
-def _shares(numbers: Numbers, name: str, values: Iterable[str]) -> Rows:
-    """Return counts and shares of values; nothing where none was counted."""
+def _shares(numbers: Numbers, name: str, values: Collection[str]) -> Rows:
+    """Return counts and shares of `values`, then of other values that were counted; nothing if none was counted."""
     counts = numbers.of(name)
     total = counts.total()
-    known = list(values)
-    return [[value, counts[value], percent(counts[value], total)] for value in (*known, *sorted({*counts} - {*known}))
-            if total]  # fmt: skip
+    names = [*values, *sorted({*counts} - {*values})] if total else []
+    return [[value, counts[value], percent(counts[value], total)] for value in names]
 
 
 def _spread(title: str, spread: Spread) -> list[Cell]:
     return [title, spread.mean, spread.std, spread.min, spread.max, spread.count]
 
 
-def _release(record: ReleaseRecord) -> Rows:
+def _counted(title: str, counts: Mapping[str, int]) -> Rows:
+    """Return a row for each name that was counted. title: of a row, with {} for the name."""
+    return [[title.format(name), count] for name, count in counts.items()]
+
+
+def _size_rows(record: ReleaseRecord) -> Rows:
+    tracks = record.flights
+    return [
+        ["trajectories", record.numbers.trajectories],
+        *_counted("tracks, {}", record.numbers.of("tracks_by_track")),
+        ["tracks whose other track is released too (column pair)", sum(track.pair is not None for track in tracks)],
+        ["walks", len({track.walk for track in tracks})],
+    ]
+
+
+def _frame_rows(record: ReleaseRecord) -> Rows:
     numbers, flags = record.numbers, record.numbers.of("flags")
-    pictures = record.settings.modalities
-    by_track = ((f"tracks, {name}", count) for name, count in numbers.of("tracks_by_track").items())
-    without = record.history.captions.frames_without.items()
-    depth = record.depth and f"{record.depth.coding}, {record.depth.unit}, sky {record.depth.sky:g}"
-    rows = {
-        "trajectories": numbers.trajectories, **dict(by_track),
-        "tracks whose other track is released too (column pair)": sum(one.pair is not None for one in record.flights),
-        "walks": len({one.walk for one in record.flights}),
-        **{f"frames of {town}": count for town, count in numbers.of("town").items()}, "frames": numbers.frames,
-        f"pictures ({', '.join(pictures)})": numbers.frames * len(pictures),
-        "fewest frames of a track, rendered": min((one.frames_available for one in record.flights), default=None),
-        "most frames of a track, rendered": max((one.frames_available for one in record.flights), default=None),
-        "time step, s": ", ".join(sorted(numbers.of("step_s"))) or None,
-        **{f"frames of {size} px": count for size, count in numbers.of("image_px").items()},
-        "frames that show the target": flags["target_visible"],
-        "frames that show the target legibly (column target_legible)":
-            flags["target_legible"] if flags["legibility_known"] == numbers.frames else None,
-        "frames with a perturbation": flags["is_perturbed"],
-        "frames with an action (column action)": numbers.of("action").total(),
-        "depth": depth or "not released", "frames with a caption": flags["has_caption"],
-        **{f"captions in {LANGUAGE_NAMES[language]}": flags[language] for language in LANGUAGES},
-        **{f"frames without a caption: {reason}": count for reason, count in without},
-    }  # fmt: skip
-    return [[name, value] for name, value in rows.items()]
+    pictures, depth = record.settings.modalities, record.depth
+    num_rendered = [track.frames_available for track in record.flights]
+    # Where legibility is not known of every frame, a count of the others would be too low.
+    num_legible = flags["target_legible"] if flags["legibility_known"] == numbers.frames else None
+    return [
+        *_counted("frames of {}", numbers.of("town")), ["frames", numbers.frames],
+        [f"pictures ({', '.join(pictures)})", numbers.frames * len(pictures)],
+        ["fewest frames of a track, rendered", min(num_rendered, default=None)],
+        ["most frames of a track, rendered", max(num_rendered, default=None)],
+        ["time step, s", ", ".join(sorted(numbers.of("step_s"))) or None],
+        *_counted("frames of {} px", numbers.of("image_px")),
+        ["frames that show the target", flags["target_visible"]],
+        ["frames that show the target legibly (column target_legible)", num_legible],
+        ["frames with a perturbation", flags["is_perturbed"]],
+        ["frames with an action (column action)", numbers.of("action").total()],
+        ["depth", f"{depth.coding}, {depth.unit}, sky {depth.sky:g}" if depth else "not released"],
+    ]  # fmt: skip
 
 
-def _quality(record: ReleaseRecord) -> Rows:
-    """Return what became of the trajectories, tracks and captions, and how smooth the motion is."""
-    planned, tracks, captions = record.history.trajectories, record.history.flights, record.history.captions
-    motion = record.numbers.of("motion")
-    five_ray = [one.five_ray_mean for one in record.flights if one.five_ray_mean is not None]
-    rows = dict[str, Cell]()
-    if planned is not None:
-        rows = {
-            "trajectories planned": planned.planned,
-            **{f"dropped before rendering: {reason}": count for reason, count in planned.dropped.items()},
-            "trajectories not rendered": planned.not_rendered, "trajectories rendered": planned.rendered,
-            "of these accepted": planned.accepted, "of these to review": planned.review,
-            "of these rejected": planned.rejected,
-            "planned for one accepted": planned.accepted and round(planned.planned / planned.accepted, 2),
-        }  # fmt: skip
-    rows |= {
-        "tracks found": tracks.found, "of these inspected": tracks.inspected,
-        **{f"tracks not released: {reason}": count for reason, count in tracks.left_out.items()},
-        "tracks released": tracks.released,
-        "mean five-ray visibility of the tracks, from the inspection": round(fmean(five_ray), 4) if five_ray else None,
-        f"tracks below {FIVE_RAY_MEAN_MIN:.0%}": sum(mean < FIVE_RAY_MEAN_MIN for mean in five_ray),
-        "trajectories whose motion is known": motion["known"],
-        f"of these within {ACCEL_RMS_MAX_MPS2:g} m/s² and {JERK_RMS_MAX_MPS3:g} m/s³": motion["within"],
-        f"of these with S below {REVIEW_BELOW:g}": motion["score_below"],
-        "captions read": captions.read,
-        **{f"captions dropped: {reason}": count for reason, count in captions.dropped.items()},
-        "captions accepted, but frame not selected": captions.frame_not_selected,
-        "captions accepted, but track not released": captions.flight_left_out,
-        "captions released": captions.released,
-    }  # fmt: skip
-    return [[name, value] for name, value in rows.items()]
+def _captioned_frame_rows(record: ReleaseRecord) -> Rows:
+    flags = record.numbers.of("flags")
+    return [
+        ["frames with a caption", flags["has_caption"]],
+        *_counted("captions in {}", {LANGUAGE_NAMES[language]: flags[language] for language in LANGUAGES}),
+        *_counted("frames without a caption: {}", record.history.captions.frames_without),
+    ]
 
 
-def _dist(record: ReleaseRecord) -> Rows:
-    spreads = record.numbers.spreads
-    return [_spread(title, spreads.get(name, Spread())) for name, title in SPREADS.items()]
+def _planned_rows(record: ReleaseRecord) -> Rows:
+    """Return what became of the planned trajectories; nothing if no source was inspected."""
+    funnel = record.history.trajectories
+    if funnel is None:
+        return []
+    return [
+        ["trajectories planned", funnel.planned],
+        *_counted("dropped before rendering: {}", funnel.dropped),
+        ["trajectories not rendered", funnel.not_rendered], ["trajectories rendered", funnel.rendered],
+        ["of these accepted", funnel.accepted], ["of these to review", funnel.review],
+        ["of these rejected", funnel.rejected],
+        ["planned for one accepted", funnel.accepted and round(funnel.planned / funnel.accepted, 2)],
+    ]  # fmt: skip
+
+
+def _track_rows(record: ReleaseRecord) -> Rows:
+    """Return what became of the tracks, how well they see the target, and how smooth the motion is."""
+    tracks, motion = record.history.flights, record.numbers.of("motion")
+    visibilities = [track.five_ray_mean for track in record.flights if track.five_ray_mean is not None]
+    mean_visibility = round(fmean(visibilities), 4) if visibilities else None
+    return [
+        ["tracks found", tracks.found], ["of these inspected", tracks.inspected],
+        *_counted("tracks not released: {}", tracks.left_out), ["tracks released", tracks.released],
+        ["mean five-ray visibility of the tracks, from the inspection", mean_visibility],
+        [f"tracks below {FIVE_RAY_MEAN_MIN:.0%}", sum(mean < FIVE_RAY_MEAN_MIN for mean in visibilities)],
+        ["trajectories whose motion is known", motion["known"]],
+        [f"of these within {ACCEL_RMS_MAX_MPS2:g} m/s² and {JERK_RMS_MAX_MPS3:g} m/s³", motion["within"]],
+        [f"of these with S below {REVIEW_BELOW:g}", motion["score_below"]],
+    ]  # fmt: skip
+
+
+def _read_caption_rows(record: ReleaseRecord) -> Rows:
+    captions = record.history.captions
+    return [
+        ["captions read", captions.read], *_counted("captions dropped: {}", captions.dropped),
+        ["captions accepted, but frame not selected", captions.frame_not_selected],
+        ["captions accepted, but track not released", captions.flight_left_out],
+        ["captions released", captions.released],
+    ]  # fmt: skip
 
 
 def _fovs(numbers: Numbers) -> Rows:
-    tracks, rows = numbers.of("tracks_by_fov"), Rows()
-    for fov, frames in sorted(numbers.of("fov").items()):
+    num_tracks, rows = numbers.of("tracks_by_fov"), Rows()
+    for fov, num_frames in sorted(numbers.of("fov").items()):
         level = next((name for lens_deg, name in LEVEL_NAMES.items() if fov == f"{lens_deg:g}"), "")
-        rows.append([fov, tracks[fov], frames, level])
+        rows.append([fov, num_tracks[fov], num_frames, level])
     return rows
+
+
+def _times_of_day(numbers: Numbers) -> list[str]:
+    """Return the columns of `_weather`: the paper's times of day, then others that were counted."""
+    return [*TIMES, *sorted({sky.partition(TAB)[2] for sky in numbers.of("sky")} - {*TIMES})]
 
 
 def _weather(numbers: Numbers, times: list[str]) -> Rows:
@@ -218,33 +238,53 @@ def _weather(numbers: Numbers, times: list[str]) -> Rows:
     return [[preset, *(skies[f"{preset}{TAB}{time}"] for time in times)] for preset in presets]
 
 
+def _events(numbers: Numbers) -> Rows:
+    rows = Rows()
+    for event, count in sorted(numbers.of("events").items()):
+        # Three parts, joined by TAB; the tabs added make three also of fewer, which only a changed record has.
+        track, name, outcome = (event + 2 * TAB).split(TAB)[:3]
+        rows.append([track, name, outcome, count])
+    return rows
+
+
 def _decisions(numbers: Numbers) -> Rows:
     decisions, labels = numbers.of("decision"), numbers.of("label")
-    total, labelled = decisions.total(), labels.total() - labels["none"]
+    total, num_labelled = decisions.total(), labels.total() - labels["none"]
     return [
-        [name, decisions[name], percent(decisions[name], total), labels[name], percent(labels[name], labelled),
-         ACTIONS[name].group if name in ACTIONS else ""]
+        [name, decisions[name], percent(decisions[name], total), labels[name], percent(labels[name], num_labelled),
+         ACTIONS[name].group]
         for name in TOKENS if total
     ]  # fmt: skip
 
 
+def _confused_tokens(numbers: Numbers) -> list[str]:
+    """Return rows and columns of `_confusion`: what occurs as a label or as a decision."""
+    counted = {name for pair in numbers.of("confusion") for name in pair.split(TAB)}
+    return [name for name in (*TOKENS, "none") if name in counted]
+
+
+def _confusion(numbers: Numbers, tokens: list[str]) -> Rows:
+    counts = numbers.of("confusion")
+    return [[label, *(counts[f"{label}{TAB}{decision}"] for decision in tokens)] for label in tokens]
+
+
 def _origin(record: ReleaseRecord) -> Rows:
-    numbers, made = record.numbers, record.provenance
-    columns = [one for one in CAPTION if one.title and one.name not in OF_THEIR_OWN]
-    rows: Rows = [[one.title, value, count] for one in columns for value, count in numbers.of(one.name).items()]
+    numbers, provenance = record.numbers, record.provenance
+    columns = [column for column in CAPTION if column.title and column.name not in WITH_TABLE]
+    rows: Rows = [[column.title, *pair] for column in columns for pair in numbers.of(column.name).items()]
     rows += [["values of the texts", name, count] for name, count in numbers.of("values").items()]
-    rows += [["captions read", f"{one.kind}: {one.model}", one.captions] for one in made.teachers]
-    rows += [["tokens", name.replace("_", " "), count] for name, count in made.tokens.items()]
-    return [*rows, ["asks", "", made.asks]]
+    rows += [["captions read", f"{who.kind}: {who.model}", who.captions] for who in provenance.teachers]
+    rows += [["tokens", name.replace("_", " "), count] for name, count in provenance.tokens.items()]
+    return [*rows, ["asks", "", provenance.asks]]
 
 
-def _lengths(numbers: Numbers) -> Rows:
+def _text_lengths(numbers: Numbers) -> Rows:
     rows = Rows()
     for language in LANGUAGES if numbers.of("flags")["has_caption"] else ():
-        for name in FIELDS[:2]:
-            least = (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS)[name]
+        for name in FIELDS[:2]:  # the texts; the last field is the decision, a token
+            floor = (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS)[name]
             title = f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}"
-            rows.append([*_spread(title, numbers.spreads.get(f"caption_{language}_{name}", Spread())), least])
+            rows.append([*_spread(title, numbers.spreads.get(f"caption_{language}_{name}", Spread())), floor])
     return rows
 
 
@@ -279,6 +319,7 @@ def run(dataset: Path, out: Path) -> Path:
 
 
 def _numeric_columns(table: Table) -> list[bool]:
+    """Return for each column whether no cell is text; a page aligns its head with the numbers."""
     return [all(isinstance(row[k], int | float | None) for row in table.rows) for k in range(len(table.head))]
 
 
