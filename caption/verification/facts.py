@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate, pairwise
 from operator import mul
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,7 @@ PARTLY_BELOW = 0.7  # rendered score under which a visible person counts as part
 SMOOTHED_OVER = 2  # frames before and after one that its velocity is fitted to
 SMOOTH_M, SMOOTH_DEG = 0.15, 1.0  # a track that deviates by more from a parabola is perturbed
 LEAST_SEEN = 3  # frames at which the target is seen, for a velocity of it
-# What each frame tells by itself.
+# The facts of single frames, which `_measure_frame` returns.
 BY_FRAME = (
     "altitude_m", "pitch_deg", "heading_deg", "distance_m", "slant_m", "height_over_target_m", "bearing_deg",
     "depression_deg", "box_width_px", "box_height_px", "offset_x_px", "offset_y_px", "visibility",
@@ -40,64 +40,50 @@ class Facts:
 
     What is measured of the target is None at frames in which it is hidden or out of view. A velocity is the slope of
     the straight line that fits positions best: of up to five neighbouring frames, or of the whole window where the
-    track jitters, so that a perturbation is not told as motion. The axes of the drone are those of the current frame:
-    forward along its heading, left, up.
-
-    Of the drone: speed_mps, 3D; velocity_mps (forward, left, up) over the whole window; mean_speed_mps its length;
-    altitude_m: world z; yaw_deg: against the oldest frame; yaw_rate_dps, climb_mps: slopes; heading_deg: in the world,
-    0 along x, in (-180, 180]; both positive to the left; pitch_deg: of the camera; travelled_m, displacement_m: path
-    length and straight line from the oldest frame.
-    Of the target: target_speeds_mps, on the ground; target_velocity_mps (forward, left) over the whole window;
-    target_speed_mps its length; target_turn_deg: change of its heading over the window; target_headings_deg: positive
-    to the left; target_travelled_m: straight line on the ground from the oldest frame.
-    Between them: place_m (forward, left, up): from the drone to the target; distance_m is horizontal, slant_m in 3D,
-    height_over_target_m from the person's hip; bearing_deg: of the target, against the drone's heading, positive to the
-    left; depression_deg: of the line of sight below the horizon.
-    mission: the kind of the order that ends the pursuit, once it is given.
-    Of other people: others_in_view, how many have a pixel; other_distance_m, from the target to the nearest of them;
-    alike_differences, in how many things, of figure, top, legs, hat and bag, the most similar person differs.
-    In the picture of width_px x height_px, in its pixels: the target's box and the offset of its centre from the image
-    centre, positive to the right and down.
-    step_speeds_mps, target_step_speeds_mps: from each frame to the next, as the paper's state has them.
+    track jitters, so that a perturbation is not told as motion. Axes are those of the drone at the current frame:
+    forward along its heading, left, up. Angles in the horizontal plane are positive to the left.
     """
 
-    speed_mps: tuple[float | None, ...]
-    velocity_mps: tuple[float, float, float]
-    mean_speed_mps: float
-    altitude_m: tuple[float, ...]
-    climb_mps: tuple[float | None, ...]
-    yaw_deg: tuple[float, ...]
-    yaw_rate_dps: tuple[float | None, ...]
-    heading_deg: tuple[float, ...]
-    pitch_deg: tuple[float, ...]
-    travelled_m: tuple[float, ...]
-    displacement_m: tuple[float, ...]
-    target_speeds_mps: tuple[float | None, ...]
-    target_velocity_mps: tuple[float, float] | None
-    target_speed_mps: float | None
-    target_turn_deg: float | None
-    target_headings_deg: tuple[float | None, ...]
-    target_travelled_m: tuple[float | None, ...]
-    place_m: tuple[tuple[float, float, float] | None, ...]
-    distance_m: tuple[float | None, ...]
-    slant_m: tuple[float | None, ...]
-    height_over_target_m: tuple[float | None, ...]
-    bearing_deg: tuple[float | None, ...]
-    depression_deg: tuple[float | None, ...]
+    # The drone.
+    speed_mps: tuple[float | None, ...]  # in 3D
+    velocity_mps: tuple[float, float, float]  # (forward, left, up), over the whole window
+    mean_speed_mps: float  # length of `velocity_mps`
+    altitude_m: tuple[float, ...]  # world z
+    climb_mps: tuple[float | None, ...]  # slope of the altitude
+    yaw_deg: tuple[float, ...]  # against the oldest frame
+    yaw_rate_dps: tuple[float | None, ...]  # slope of `yaw_deg`
+    heading_deg: tuple[float, ...]  # in the world, 0 along x, in (-180, 180]
+    pitch_deg: tuple[float, ...]  # of the camera
+    travelled_m: tuple[float, ...]  # length of the path from the oldest frame
+    displacement_m: tuple[float, ...]  # straight line from the oldest frame
+    step_speeds_mps: tuple[float | None, ...]  # from the frame before, in 3D, as the paper's state has them
+    target_speeds_mps: tuple[float | None, ...]  # on the ground
+    target_velocity_mps: tuple[float, float] | None  # (forward, left), over the whole window
+    target_speed_mps: float | None  # length of `target_velocity_mps`
+    target_turn_deg: float | None  # change of its heading over the window
+    target_headings_deg: tuple[float | None, ...]  # in the world, 0 along x
+    target_travelled_m: tuple[float | None, ...]  # straight line on the ground from the first frame that shows it
+    target_step_speeds_mps: tuple[float | None, ...]  # as `step_speeds_mps`, on the ground
+    # From the drone to the target.
+    place_m: tuple[tuple[float, float, float] | None, ...]  # (forward, left, up)
+    distance_m: tuple[float | None, ...]  # horizontal
+    slant_m: tuple[float | None, ...]  # in 3D
+    height_over_target_m: tuple[float | None, ...]  # of the drone over the person's hip
+    bearing_deg: tuple[float | None, ...]  # of the target, against the drone's heading at the frame
+    depression_deg: tuple[float | None, ...]  # of the line of sight below the horizon
+    # In the picture, in its pixels: the box of the target, and how far its centre is from that of the picture.
     box_width_px: tuple[int | None, ...]
     box_height_px: tuple[int | None, ...]
-    offset_x_px: tuple[int | None, ...]
-    offset_y_px: tuple[int | None, ...]
+    offset_x_px: tuple[int | None, ...]  # positive to the right
+    offset_y_px: tuple[int | None, ...]  # positive down
     visibility: tuple[VisibilityWord, ...]
-    width_px: int
+    width_px: int  # of the picture
     height_px: int
-    step_s: float
-    mission: str | None
-    others_in_view: tuple[int | None, ...]
-    other_distance_m: tuple[float | None, ...]
-    alike_differences: tuple[int | None, ...]
-    step_speeds_mps: tuple[float | None, ...] = ()
-    target_step_speeds_mps: tuple[float | None, ...] = ()
+    others_in_view: tuple[int | None, ...]  # how many other people have a pixel
+    other_distance_m: tuple[float | None, ...]  # from the target to the nearest of them
+    alike_differences: tuple[int | None, ...]  # of figure, top, legs, hat and bag, in the person most like the target
+    step_s: float  # mean time between two frames
+    mission: str | None  # the kind of the order that ends the pursuit, once it is given
 
     def __len__(self) -> int:
         return len(self.yaw_deg)
@@ -114,7 +100,7 @@ class Facts:
 
     @cached_property
     def found(self) -> dict[Any, Any]:
-        """The facts that were looked up (references.py): several languages and checks ask for the same ones."""
+        """What was computed from the facts, by key: several languages and checks need the same results."""
         return {}
 
 
@@ -127,31 +113,14 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
     camera_px = (window.width_px, window.height_px)
     picture_px = picture_px or camera_px
     frames = window.frames
-    count = len(frames)
-    measured = zip(*[_measure_frame(frame, camera_px, picture_px) for frame in frames], strict=True)
-    by_frame: dict[str, Any] = dict(zip(BY_FRAME, measured, strict=True))
-    xs, ys, zs = zip(*[frame.position_m for frame in frames], strict=True)
+    measured = [_measure_frame(frame, camera_px, picture_px) for frame in frames]
+    by_frame: dict[str, Any] = {name: tuple([facts.get(name) for facts in measured]) for name in BY_FRAME}
     seen = tuple([distance_m is not None for distance_m in by_frame["distance_m"]])
-    step_s = (frames[-1].time_s - frames[0].time_s) / (count - 1)
-    turns_deg = [wrap_deg(after.rotation_deg[1] - before.rotation_deg[1]) for before, after in pairwise(frames)]
-    yaw_deg = [0.0, *accumulate(turns_deg)]
-    is_known = (True,) * count
-    (v_x, v_y, v_z), local = _velocities((xs, ys, zs), is_known, step_s, SMOOTH_M)
-    velocities = list(zip(*local, strict=True))
-    yaw_rad = math.radians(frames[-1].rotation_deg[1])
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    steps_m = [math.dist(before.position_m, after.position_m) for before, after in pairwise(frames)]
+    step_s = (frames[-1].time_s - frames[0].time_s) / (len(frames) - 1)
     return Facts(
-        speed_mps=_rounded([math.hypot(*velocity) for velocity in velocities], 2),
-        velocity_mps=(_round(v_x * cos + v_y * sin, 2), _round(v_y * cos - v_x * sin, 2), _round(v_z, 2)),
-        mean_speed_mps=_round(math.hypot(v_x, v_y, v_z), 2),
-        climb_mps=_rounded([velocity[2] for velocity in velocities], 2),
-        yaw_deg=tuple([_round(angle, 1) for angle in yaw_deg]),
-        yaw_rate_dps=_rounded(_velocities((yaw_deg,), is_known, step_s, SMOOTH_DEG)[1][0], 1),
-        travelled_m=(0.0, *[_round(way, 1) for way in accumulate(steps_m)]),
-        displacement_m=tuple([_round(math.dist(frames[0].position_m, frame.position_m), 1) for frame in frames]),
         **by_frame,
-        **_measure_target(frames, seen, step_s, cos, sin),
+        **_measure_drone(frames, step_s),
+        **_measure_target(frames, seen, step_s),
         width_px=picture_px[0],
         height_px=picture_px[1],
         step_s=round(step_s, 3),
@@ -159,76 +128,91 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
         others_in_view=_rounded([frame.others_in_view for frame in frames], None),
         other_distance_m=_rounded([frame.other_distance_m for frame in frames], 1),
         alike_differences=_rounded([frame.alike_differences for frame in frames], None),
-        step_speeds_mps=(None, *_rounded([step_m / step_s for step_m in steps_m], 2)),
     )
 
 
-def _measure_target(
-    frames: Sequence[ObservedFrame], seen: tuple[bool, ...], step_s: float, cos: float, sin: float
-) -> dict[str, Any]:
-    """Measure where the target is and how it moves, at the frames at which it is seen.
+def _forward_left(x: float, y: float, current: ObservedFrame) -> tuple[float, float]:
+    """Return a horizontal vector of the world in the axes of the drone at the current frame."""
+    yaw_rad = math.radians(current.rotation_deg[1])
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    return x * cos + y * sin, y * cos - x * sin
 
-    Args:
-        cos, sin: of the drone's heading at the current frame.
-    """
-    xs, ys, _ = zip(*[frame.target_m for frame in frames], strict=True)
-    places = []
+
+def _measure_drone(frames: Sequence[ObservedFrame], step_s: float) -> dict[str, Any]:
+    """Measure how the drone moves and turns."""
+    axes = list(zip(*[frame.position_m for frame in frames], strict=True))
+    turns_deg = [wrap_deg(after.rotation_deg[1] - before.rotation_deg[1]) for before, after in pairwise(frames)]
+    yaw_deg = [0.0, *accumulate(turns_deg)]
+    steps_m = [math.dist(before.position_m, after.position_m) for before, after in pairwise(frames)]
+    is_known = (True,) * len(frames)
+    (v_x, v_y, v_z), local = _velocities(axes, is_known, step_s, SMOOTH_M)
+    _, [yaw_rates_dps] = _velocities((yaw_deg,), is_known, step_s, SMOOTH_DEG)
+    forward, left = _forward_left(v_x, v_y, frames[-1])
+    return {
+        "speed_mps": _rounded([math.hypot(*velocity) for velocity in zip(*local, strict=True)], 2),
+        "velocity_mps": _rounded((forward, left, v_z), 2),
+        "mean_speed_mps": _round(math.hypot(v_x, v_y, v_z), 2),
+        "climb_mps": _rounded(local[2], 2),
+        "yaw_deg": _rounded(yaw_deg, 1),
+        "yaw_rate_dps": _rounded(yaw_rates_dps, 1),
+        "travelled_m": (0.0, *_rounded(accumulate(steps_m), 1)),
+        "displacement_m": _rounded([math.dist(frames[0].position_m, frame.position_m) for frame in frames], 1),
+        "step_speeds_mps": (None, *_rounded([step_m / step_s for step_m in steps_m], 2)),
+    }
+
+
+def _measure_target(frames: Sequence[ObservedFrame], seen: tuple[bool, ...], step_s: float) -> dict[str, Any]:
+    """Measure where the target is and how it moves, at the frames at which it is seen."""
+    places_m, positions = [], []  # positions: (x, y) in the world; NaN where the target is not seen
     for frame, is_seen in zip(frames, seen, strict=True):
         away_x, away_y, away_z = (b - a for a, b in zip(frame.position_m, frame.target_m, strict=True))
-        place = (away_x * cos + away_y * sin, away_y * cos - away_x * sin, away_z)
-        places.append((_round(place[0], 1), _round(place[1], 1), _round(place[2], 1)) if is_seen else None)
-    # The paper's state has the speed from frame to frame.
-    steps_mps = [
-        math.hypot(xs[i] - xs[i - 1], ys[i] - ys[i - 1]) / step_s if seen[i] and seen[i - 1] else math.nan
-        for i in range(1, len(frames))
-    ]
-    first = seen.index(True) if any(seen) else 0
-    travelled = [
-        math.hypot(x - xs[first], y - ys[first]) if is_seen else math.nan
-        for x, y, is_seen in zip(xs, ys, seen, strict=True)
-    ]
+        places_m.append(_rounded((*_forward_left(away_x, away_y, frames[-1]), away_z), 1) if is_seen else None)
+        positions.append(frame.target_m[:2] if is_seen else (math.nan, math.nan))
+    first = positions[seen.index(True) if any(seen) else 0]
     (v_x, v_y), local = (math.nan, math.nan), [[math.nan] * len(frames)] * 2
     if sum(seen) >= LEAST_SEEN:
-        (v_x, v_y), local = _velocities((xs, ys), seen, step_s, SMOOTH_M)
+        (v_x, v_y), local = _velocities(list(zip(*positions, strict=True)), seen, step_s, SMOOTH_M)
     velocities = list(zip(*local, strict=True))
     speeds = [math.hypot(*velocity) for velocity in velocities]
     headings = [
         math.degrees(math.atan2(y, x)) if speed > STANDING_MPS else math.nan  # NaN is not larger either
         for (x, y), speed in zip(velocities, speeds, strict=True)
     ]
-    known = [heading for heading in headings if heading == heading]
-    velocity = (_round(v_x * cos + v_y * sin, 2), _round(v_y * cos - v_x * sin, 2))
-    [speed] = _rounded([math.hypot(v_x, v_y)], 2)
+    known = [heading for heading in headings if not math.isnan(heading)]
+    speed = _round(math.hypot(v_x, v_y), 2)
     return {
-        "place_m": tuple(places),
-        "target_step_speeds_mps": (None, *_rounded(steps_mps, 2)),
-        "target_travelled_m": _rounded(travelled, 1),
+        "place_m": tuple(places_m),
+        "target_step_speeds_mps": (None, *_rounded([math.dist(a, b) / step_s for a, b in pairwise(positions)], 2)),
+        "target_travelled_m": _rounded([math.dist(first, position) for position in positions], 1),
         "target_speeds_mps": _rounded(speeds, 2),
         "target_headings_deg": _rounded(headings, 1),
-        "target_velocity_mps": None if speed is None else velocity,
+        "target_velocity_mps": None if speed is None else _rounded(_forward_left(v_x, v_y, frames[-1]), 2),
         "target_speed_mps": speed,
         # The heading of someone who stands is noise.
         "target_turn_deg": _round(wrap_deg(known[-1] - known[0]), 1) if known and len(known) == sum(seen) else None,
     }
 
 
-Weights = tuple[float, ...]  # of the values of a series; rows of frames that are not known are NaN or skipped
+Weights = tuple[float, ...]  # one for each value of a series; the result is the sum of their products
+
+
+class Fit(NamedTuple):
+    """Weights for the frames at which a series is known."""
+
+    line: Weights  # for the slope per step of the straight line through all known frames
+    lines: tuple[Weights, ...]  # for each frame, of the line through its neighbours; NaN where it is not known
+    residuals: tuple[Weights, ...]  # for each known frame, of its deviation from the parabola that fits best
 
 
 @lru_cache(maxsize=256)
-def _fit_of(known: tuple[bool, ...]) -> tuple[Weights, tuple[Weights, ...], tuple[Weights, ...]]:
-    """Return weights for the frames at which a series is known.
-
-    They turn it into the slope per step of the straight line through all of them, into that of the line through the
-    neighbours of each frame, and into the deviations from the parabola that fits best.
-    """
+def _fit_of(known: tuple[bool, ...]) -> Fit:
     frames = [i for i, is_known in enumerate(known) if is_known]
     basis = np.vander(np.array(frames) - np.mean(frames), 3)
     residuals = np.zeros((len(frames), len(known)))
     residuals[:, frames] = np.eye(len(frames)) - basis @ np.linalg.pinv(basis)
-    near = [[i for i in frames if abs(i - at) <= SMOOTHED_OVER] if known[at] else [] for at in range(len(known))]
-    local = tuple(_line_weights(neighbours, len(known)) for neighbours in near)
-    return _line_weights(frames, len(known)), local, tuple(map(tuple, residuals.tolist()))
+    neighbours = [[i for i in frames if abs(i - k) <= SMOOTHED_OVER] if known[k] else [] for k in range(len(known))]
+    lines = tuple(_line_weights(near, len(known)) for near in neighbours)
+    return Fit(_line_weights(frames, len(known)), lines, tuple(map(tuple, residuals.tolist())))
 
 
 def _line_weights(frames: Sequence[int], count: int) -> Weights:
@@ -253,49 +237,58 @@ def _velocities(
         smooth: the largest root mean square deviation from a parabola, in units of the axes, at which neighbouring
             frames tell the velocity; beyond it every frame has that of the whole window.
     """
-    line, lines, residuals = _fit_of(known)
+    fit = _fit_of(known)
     if not all(known):  # a weight of 0 does not hide NaN
         axes = [[value if is_known else 0.0 for value, is_known in zip(axis, known, strict=True)] for axis in axes]
-    whole = [_weighted(line, axis) / step_s for axis in axes]
-    squares = sum([_weighted(row, axis) ** 2 for axis in axes for row in residuals])
-    if squares > smooth * smooth * len(residuals):
+    whole = [_weighted(fit.line, axis) / step_s for axis in axes]
+    squares = sum([_weighted(weights, axis) ** 2 for axis in axes for weights in fit.residuals])
+    if squares > smooth * smooth * len(fit.residuals):
         return whole, [[slope if is_known else math.nan for is_known in known] for slope in whole]
-    return whole, [[_weighted(row, axis) / step_s for row in lines] for axis in axes]
+    return whole, [[_weighted(weights, axis) / step_s for weights in fit.lines] for axis in axes]
 
 
 @lru_cache(maxsize=64)  # five windows of a track share a frame
-def _measure_frame(frame: ObservedFrame, camera_px: tuple[int, int], picture_px: tuple[int, int]) -> tuple[Any, ...]:
-    """Measure one frame; return BY_FRAME."""
-    (x, y, z), (u, v, w), (pitch, heading, _) = frame.position_m, frame.target_m, frame.rotation_deg
-    drone = (_round(z, 1), _round(pitch, 1), _round(wrap_deg(heading), 1))
+def _measure_frame(frame: ObservedFrame, camera_px: tuple[int, int], picture_px: tuple[int, int]) -> dict[str, Any]:
+    """Measure one frame; return the facts BY_FRAME, without those of a target that is not seen."""
+    (x, y, z), (target_x, target_y, target_z) = frame.position_m, frame.target_m
+    pitch, heading, _ = frame.rotation_deg
     word = _word(frame)
-    if u != u or word in ("occluded", "out_of_view"):
-        return (*drone, *(None,) * 9, word)
+    facts: dict[str, Any] = {
+        "altitude_m": _round(z, 1), "pitch_deg": _round(pitch, 1), "heading_deg": _round(wrap_deg(heading), 1),
+        "visibility": word,
+    }  # fmt: skip
+    if math.isnan(target_x) or word in ("occluded", "out_of_view"):
+        return facts
     # + 0.0: no negative zero, which is equal to zero here and another direction to atan2
-    away_x, away_y, away_z = u - x + 0.0, v - y + 0.0, w - z + 0.0
+    away_x, away_y, away_z = target_x - x + 0.0, target_y - y + 0.0, target_z - z + 0.0
     distance = math.hypot(away_x, away_y)
-    slant = math.hypot(distance, away_z)
-    bearing = wrap_deg(math.degrees(math.atan2(away_y, away_x)) - heading)
-    depression = math.degrees(math.atan2(-away_z, distance))
     x_scale, y_scale = picture_px[0] / camera_px[0], picture_px[1] / camera_px[1]
     left, top, right, bottom = frame.target_bbox
     left, top, right, bottom = left * x_scale, top * y_scale, right * x_scale, bottom * y_scale
     # The centre of the box is where the person is seen; uv (the hip) replaces it where a tree has no box.
     centre_x, centre_y = (left + right) / 2.0, (top + bottom) / 2.0
-    if left != left:
+    if math.isnan(left):
         centre_x, centre_y = frame.target_uv[0] * x_scale, frame.target_uv[1] * y_scale
-    offsets = (centre_x - picture_px[0] / 2.0, centre_y - picture_px[1] / 2.0)
-    in_space = _rounded((distance, slant, -away_z, bearing, depression), 1)
-    return (*drone, *in_space, *_rounded((right - left, bottom - top, *offsets), None), word)
+    return facts | {
+        "distance_m": _round(distance, 1),
+        "slant_m": _round(math.hypot(distance, away_z), 1),
+        "height_over_target_m": _round(-away_z, 1),
+        "bearing_deg": _round(wrap_deg(math.degrees(math.atan2(away_y, away_x)) - heading), 1),
+        "depression_deg": _round(math.degrees(math.atan2(-away_z, distance)), 1),
+        "box_width_px": _round(right - left),
+        "box_height_px": _round(bottom - top),
+        "offset_x_px": _round(centre_x - picture_px[0] / 2.0),
+        "offset_y_px": _round(centre_y - picture_px[1] / 2.0),
+    }
 
 
-def _round(value: float, digits: int) -> float:
-    return round(value, digits) + 0.0  # no negative zero
+def _round(value: float, digits: int | None = None) -> Any:
+    """Return a value, as an integer without `digits`; None for NaN."""
+    return None if math.isnan(value) else round(value, digits) + 0  # + 0: no negative zero
 
 
 def _rounded(values: Iterable[float], digits: int | None) -> tuple[Any, ...]:
-    """Return values, as integers without `digits`, and None where they are NaN, which is not equal to itself."""
-    return tuple([None if v != v else round(v, digits) + 0 for v in values])
+    return tuple([_round(value, digits) for value in values])
 
 
 def _word(frame: ObservedFrame) -> VisibilityWord:
