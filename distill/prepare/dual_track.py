@@ -5,10 +5,11 @@ Needs neither captions nor torch.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -20,12 +21,12 @@ from cosfly.geometry.axes import step_s
 from cosfly.geometry.splits import SPLITS, Course, walks_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError, VerifyError
-from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, fingerprint, write_failures
+from cosfly.runtime.run_dir import Dropped, Failed, Resume, StageFolder, Tally, fingerprint, write_failures
 from distill.prepare.stage import SplitConfig, check_names, run_of, track_key
 from distill.schema import SourceTree, SplitMember, tree_inputs, write_page, write_splits
 
 STAGE = "distill.dual_track"
-STEP_TOLERANCE_S = 1e-3
+STEP_TOLERANCE_S = 1e-3  # by which steps within a window may differ from the track's
 PAGE_TEXT = """\
 Windows of {cfg.observed} frames of a perturbed track (`observed_*`), with the unperturbed poses of drone and target in
 them (`clean_*`) and in the {cfg.predicted} frames after them (`future_*`); a window begins every {cfg.stride} frames.
@@ -56,6 +57,13 @@ class TrackSample(SplitMember):
     future_target_m: tuple[Vector | None, ...]
 
 
+class Pair(NamedTuple):
+    """The two tracks of one trajectory, of the same frames."""
+
+    perturbed: Track
+    clean: Track
+
+
 class DualTrackConfig(SplitConfig):
     """Settings of `distill dual-track`; defaults of tab:augmentation_params."""
 
@@ -76,7 +84,8 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
     are failures and do not stop the others.
 
     Raises:
-        NothingKept: no track gives a window. InputError: two trees are of one run.
+        NothingKept: no track gives a window.
+        InputError: two trees are of one run.
     """
     check_names([run_of(tree) for tree in trees])
     runs = {run_of(tree): tree for tree in trees}
@@ -84,57 +93,63 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
     if stage.is_complete:
         return out
     folders = {place_of(folder, run): folder for run, tree in runs.items() for folder in find_tracks(tree)}
-    ids, pairs = flight_ids(folders), dict[Place, tuple[Track, Track]]()
-    tally, failures = Tally(), list[Failed]()
-    with progress_bar(f"{STAGE}: reading", total=len(folders)) as advance:
-        for place, folder in folders.items():
-            advance(1)
-            try:
-                pair = None if folder.name == ORIGINAL else _read_pair(folder, cfg)
-            except InputError as error:
-                failures.append(Failed(id=f"{track_key(place)}/{place.variant}", code=error.code, message=str(error)))
-                tally.count(failures[-1])
-                continue
-            if isinstance(pair, str):
-                tally.dropped[pair] += 1
-            elif pair is not None:
-                pairs[place] = pair
+    ids = flight_ids(folders)
+    pairs, failures, tally = _read_pairs(folders, cfg)
     write_failures(out / "failures.jsonl", failures)
-    tally.kept = len(pairs)
-    tally.input = tally.kept + tally.dropped.total() + len(failures)
     if not pairs:
         raise stage.nothing_kept(tally, expected=f"a perturbed track of {cfg.length} frames with its clean track")
-    walks = walks_of(Course(track_key(at), at.town, twin.time_s, twin.walked_m) for at, (_, twin) in pairs.items())
+    keys = {place: track_key(place) for place in pairs}
+    walks = walks_of(Course(keys[at], at.town, clean.time_s, clean.walked_m) for at, (_, clean) in pairs.items())
     split_of = cfg.assigned(walks, walks, seed)
-    tracks = {split: [place for place in pairs if split_of[track_key(place)] == split] for split in SPLITS}
+    walk_of = {place: walks[key] for place, key in keys.items()}
+    places = {split: [place for place in pairs if split_of[keys[place]] == split] for split in SPLITS}
     samples = {
-        split: (s for at in own for s in samples_of(at, ids[at], *pairs[at], walks[track_key(at)], cfg))
-        for split, own in tracks.items()
+        split: chain.from_iterable(samples_of(place, ids[place], pairs[place], walk_of[place], cfg) for place in part)
+        for split, part in places.items()
     }
     counts, paths = write_splits(out, TrackSample, samples)
     sources = [SourceTree(run=name, sha256=fingerprint(tree)) for name, tree in runs.items()]
     page = write_page(out, "Windows over two tracks", counts, sources, PAGE_TEXT.format(cfg=cfg))
     facts = {
-        split: {"samples": counts[split], "tracks": len(own), "walks": len({walks[track_key(place)] for place in own})}
-        for split, own in tracks.items()
+        split: {"samples": counts[split], "tracks": len(part), "walks": len({walk_of[place] for place in part})}
+        for split, part in places.items()
     }
-    num_uneven = sum(len(windows_of(len(track), cfg)) for track, _ in pairs.values()) - sum(counts.values())
+    num_uneven = sum(len(windows_of(len(pair.clean), cfg)) for pair in pairs.values()) - sum(counts.values())
     stage.finish([*paths, page], tally, splits=facts, windows_left_out={"uneven_steps": num_uneven})
     return out
 
 
-def _read_pair(folder: Path, cfg: DualTrackConfig) -> tuple[Track, Track] | str | None:
-    """Read a perturbed track and its clean one; None for a clean track, a reason if there are no windows."""
-    track = read_track(folder)
-    if track.is_original:
-        return None
+def _read_pairs(folders: Mapping[Place, Path], cfg: DualTrackConfig) -> tuple[dict[Place, Pair], list[Failed], Tally]:
+    """Read all perturbed tracks with their clean ones; return the pairs, the failures, and the counts of both."""
+    pairs, failures, tally = dict[Place, Pair](), list[Failed](), Tally()
+    with progress_bar(f"{STAGE}: reading", total=len(folders)) as advance:
+        for place, folder in folders.items():
+            advance(1)
+            result = _read_pair(place, folder, cfg)
+            if isinstance(result, Pair):
+                pairs[place] = result
+            elif result is not None and (failure := tally.count(result)):
+                failures.append(failure)
+    tally.kept = len(pairs)
+    tally.input = tally.kept + tally.dropped.total() + len(failures)
+    return pairs, failures, tally
+
+
+def _read_pair(place: Place, folder: Path, cfg: DualTrackConfig) -> Pair | Dropped | Failed | None:
+    """Read a perturbed track and its clean one; None for a clean track."""
+    track_id = f"{track_key(place)}/{place.variant}"
     try:
-        twin = read_twin(track)
+        track = None if folder.name == ORIGINAL else read_track(folder)
+        if track is None or track.is_original:  # a clean track may be in a folder of any name
+            return None
+        clean = read_twin(track)
     except VerifyError:
-        return "clean_flight_of_other_frames"
-    if twin is None:
-        return "no_clean_flight"
-    return (track, twin) if windows_of(len(track), cfg) else "shorter_than_a_window"
+        return Dropped(id=track_id, reason="clean_flight_of_other_frames")
+    except InputError as error:
+        return Failed(id=track_id, code=error.code, message=str(error))
+    if clean is None:
+        return Dropped(id=track_id, reason="no_clean_flight")
+    return Pair(track, clean) if windows_of(len(track), cfg) else Dropped(id=track_id, reason="shorter_than_a_window")
 
 
 def windows_of(num_frames: int, cfg: DualTrackConfig) -> range:
@@ -142,22 +157,21 @@ def windows_of(num_frames: int, cfg: DualTrackConfig) -> range:
     return range(0, num_frames - cfg.length + 1, cfg.stride)
 
 
-def samples_of(
-    place: Place, flight_id: str, track: Track, twin: Track, walk: str, cfg: DualTrackConfig
-) -> Iterator[TrackSample]:
+def samples_of(place: Place, flight_id: str, pair: Pair, walk: str, cfg: DualTrackConfig) -> Iterator[TrackSample]:
     """Cut a pair of tracks into windows, without those whose frames are not evenly apart in time."""
-    step = step_s(track.time_s)
-    for first in windows_of(len(track), cfg):
-        now, end = first + cfg.observed, first + cfg.length
-        time_s = track.time_s[first:end]
+    perturbed, clean = pair
+    step = step_s(perturbed.time_s)
+    for first in windows_of(len(perturbed), cfg):
+        now, end = first + cfg.observed, first + cfg.length  # where the observed and the predicted frames end
+        time_s = perturbed.time_s[first:end]
         if len(time_s) > 1 and np.abs(np.diff(time_s) - step).max() > STEP_TOLERANCE_S:
             continue
         seen, after = slice(first, now), slice(now, end)
         vectors: dict[str, Any] = {}
-        for part, source, rows in (("observed", track, seen), ("clean", twin, seen), ("future", twin, after)):
-            vectors[f"{part}_position_m"] = _vectors(source.positions_m[rows])
-            vectors[f"{part}_rotation_deg"] = _vectors(source.rotations_deg[rows])
-            vectors[f"{part}_target_m"] = _vectors(source.targets_m[rows])
+        for part, track, rows in (("observed", perturbed, seen), ("clean", clean, seen), ("future", clean, after)):
+            vectors[f"{part}_position_m"] = _vectors(track.positions_m[rows])
+            vectors[f"{part}_rotation_deg"] = _vectors(track.rotations_deg[rows])
+            vectors[f"{part}_target_m"] = _vectors(track.targets_m[rows])
         yield TrackSample(
             sample_id=sample_id(flight_id, now - 1),
             **asdict(place),
@@ -165,11 +179,11 @@ def samples_of(
             window=tuple(range(first, now)),
             future=tuple(range(now, end)),
             time_s=tuple(time_s.tolist()),
-            states=tuple(track.states[first:now]),
+            states=tuple(perturbed.states[seen]),
             **vectors,
         )
 
 
 def _vectors(rows: np.ndarray) -> tuple[Any, ...]:
     """Return vectors (k, 3) as tuples, those with NaN as None."""
-    return tuple(None if np.isnan(row).any() else tuple(row.tolist()) for row in rows + 0.0)
+    return tuple(None if np.isnan(row).any() else tuple(row.tolist()) for row in rows + 0.0)  # no negative zeros
