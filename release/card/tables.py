@@ -31,20 +31,15 @@ VERDICTS = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
 
 
 class Table(Record):
-    """One table of a release.
-
-    paper: Labels of the tables, figures or sections of the paper that it corresponds to; None: of none.
-    rows: Each as long as `head`.
-    plot: How a page draws it: the second column as bars, or all numbers but the first column as a heat map.
-    """
+    """One table of a release."""
 
     key: str
     title: str
     head: list[str]
-    rows: Rows
-    paper: str | None = None
+    rows: Rows  # each as long as `head`
+    paper: str | None = None  # labels of the tables, figures or sections of the paper that it corresponds to
     note: str = ""
-    plot: Plot | None = None
+    plot: Plot | None = None  # how a page draws it: the second column as bars, or all numbers as a heat map
 
 
 SPREAD = ["mean", "std", "least", "most", "values"]  # the columns of `_spread`, after its title
@@ -77,19 +72,20 @@ def tables_of(record: ReleaseRecord) -> list[Table]:
 def all_tables(record: ReleaseRecord) -> list[Table]:
     """Return all tables in the order of the card, also those without rows."""
     numbers = record.numbers
-    times, tokens, repairs = _times_of_day(numbers), _confused_tokens(numbers), numbers.of("repair_strategy")
+    weather_head, weather_rows = _weather(numbers)
+    confusion_head, confusion_rows = _confusion(numbers)
     return [
         Table(key="release", title="The release", paper="sec:dataset_stats, sec:exp_release", head=["", "number"],
-              rows=[*_size_rows(record), *_frame_rows(record), *_captioned_frame_rows(record)]),
+              rows=_content_rows(record)),
         Table(key="quality_stats", title="From plan to release", paper="tab:quality_stats", head=["", "number"],
-              rows=[*_planned_rows(record), *_track_rows(record), *_read_caption_rows(record)]),
+              rows=[*_planned_rows(record), *_outcome_rows(record)]),
         Table(key="dist_stats", title="Tracks and trajectories", paper="tab:dist_stats", head=["axis", *SPREAD],
               rows=[_spread(title, numbers.spreads.get(name, Spread())) for name, title in SPREADS.items()],
               note="Of trajectories without perturbation: of the clean track, or the perturbed one minus its offsets."),
         Table(key="fovs", title="Fields of view", paper="tab:zoom_config, sec:exp_release",
               head=["degrees", "tracks", "frames", "level"], rows=_fovs(numbers), plot="bars"),
-        Table(key="weather", title="Weather and time of day", paper="tab:weather_coverage", head=["preset", *times],
-              rows=_weather(numbers, times), plot="heat", note="Frames. The presets of the paper are all listed."),
+        Table(key="weather", title="Weather and time of day", paper="tab:weather_coverage", head=weather_head,
+              rows=weather_rows, plot="heat", note="Frames. The presets of the paper are all listed."),
         Table(key="augmentation_states", title="Perturbation", paper="tab:augmentation_states", plot="bars",
               head=["state", "frames", "%"], rows=_shares(numbers, "states", STATES),
               note="Frames of perturbed tracks by their recorded offsets, after fallbacks."),
@@ -102,12 +98,12 @@ def all_tables(record: ReleaseRecord) -> list[Table]:
         Table(key="decisions", title="Decisions", paper="tab:coc_actions", plot="bars", rows=_decisions(numbers),
               head=["action", "decisions", "%", "labels", "% ", "group"]),  # "% ": no two columns have one name
         Table(key="confusion", title="Label (rows) against decision (columns)", paper="fig:confusion_patterns",
-              head=["label", *tokens], rows=_confusion(numbers, tokens), plot="heat"),
+              head=confusion_head, rows=confusion_rows, plot="heat"),
         Table(key="verdicts", title="Decision against the geometry", paper="fig:consistency_verdict", plot="bars",
               head=["verdict", "captions", "%"], rows=_shares(numbers, "verdict", VERDICTS),
               note="Of accepted captions, after repair; the figure of the paper shows first answers, before repair."),
-        Table(key="repairs", title="Repairs", paper="fig:regen_strategy", plot="bars",
-              head=["strategy", "captions", "%"], rows=_shares(numbers, "repair_strategy", repairs)),
+        Table(key="repairs", title="Repairs", paper="fig:regen_strategy", head=["strategy", "captions", "%"],
+              rows=_shares(numbers, "repair_strategy", numbers.of("repair_strategy")), plot="bars"),
         Table(key="origin", title="Origin of the captions", paper="tab:caption_pipeline", head=["", "", "number"],
               rows=_origin(record), note=ORIGIN_NOTE),
         Table(key="text_lengths", title="Length of the texts", paper="fig:coc_lengths", head=["text", *SPREAD, "floor"],
@@ -137,23 +133,18 @@ def _counted(title: str, counts: Mapping[str, int]) -> Rows:
     return [[title.format(name), count] for name, count in counts.items()]
 
 
-def _size_rows(record: ReleaseRecord) -> Rows:
-    tracks = record.flights
-    return [
-        ["trajectories", record.numbers.trajectories],
-        *_counted("tracks, {}", record.numbers.of("tracks_by_track")),
-        ["tracks whose other track is released too (column pair)", sum(track.pair is not None for track in tracks)],
-        ["walks", len({track.walk for track in tracks})],
-    ]
-
-
-def _frame_rows(record: ReleaseRecord) -> Rows:
+def _content_rows(record: ReleaseRecord) -> Rows:
+    """Return what the release holds: tracks, frames, and frames with a caption."""
     numbers, flags = record.numbers, record.numbers.of("flags")
-    pictures, depth = record.settings.modalities, record.depth
-    num_rendered = [track.frames_available for track in record.flights]
+    tracks, pictures, depth = record.flights, record.settings.modalities, record.depth
+    num_rendered = [track.frames_available for track in tracks]
     # Where legibility is not known of every frame, a count of the others would be too low.
     num_legible = flags["target_legible"] if flags["legibility_known"] == numbers.frames else None
     return [
+        ["trajectories", numbers.trajectories], *_counted("tracks, {}", numbers.of("tracks_by_track")),
+        ["tracks whose other track is released too (column pair)", sum(track.pair is not None for track in tracks)],
+        ["walks", len({track.walk for track in tracks})],
+
         *_counted("frames of {}", numbers.of("town")), ["frames", numbers.frames],
         [f"pictures ({', '.join(pictures)})", numbers.frames * len(pictures)],
         ["fewest frames of a track, rendered", min(num_rendered, default=None)],
@@ -165,16 +156,11 @@ def _frame_rows(record: ReleaseRecord) -> Rows:
         ["frames with a perturbation", flags["is_perturbed"]],
         ["frames with an action (column action)", numbers.of("action").total()],
         ["depth", f"{depth.coding}, {depth.unit}, sky {depth.sky:g}" if depth else "not released"],
-    ]  # fmt: skip
 
-
-def _captioned_frame_rows(record: ReleaseRecord) -> Rows:
-    flags = record.numbers.of("flags")
-    return [
         ["frames with a caption", flags["has_caption"]],
         *_counted("captions in {}", {LANGUAGE_NAMES[language]: flags[language] for language in LANGUAGES}),
         *_counted("frames without a caption: {}", record.history.captions.frames_without),
-    ]
+    ]  # fmt: skip
 
 
 def _planned_rows(record: ReleaseRecord) -> Rows:
@@ -192,9 +178,9 @@ def _planned_rows(record: ReleaseRecord) -> Rows:
     ]  # fmt: skip
 
 
-def _track_rows(record: ReleaseRecord) -> Rows:
-    """Return what became of the tracks, how well they see the target, and how smooth the motion is."""
-    tracks, motion = record.history.flights, record.numbers.of("motion")
+def _outcome_rows(record: ReleaseRecord) -> Rows:
+    """Return what became of tracks and captions, how well tracks see the target, and how smooth their motion is."""
+    tracks, captions, motion = record.history.flights, record.history.captions, record.numbers.of("motion")
     visibilities = [track.five_ray_mean for track in record.flights if track.five_ray_mean is not None]
     mean_visibility = round(fmean(visibilities), 4) if visibilities else None
     return [
@@ -202,15 +188,11 @@ def _track_rows(record: ReleaseRecord) -> Rows:
         *_counted("tracks not released: {}", tracks.left_out), ["tracks released", tracks.released],
         ["mean five-ray visibility of the tracks, from the inspection", mean_visibility],
         [f"tracks below {FIVE_RAY_MEAN_MIN:.0%}", sum(mean < FIVE_RAY_MEAN_MIN for mean in visibilities)],
+
         ["trajectories whose motion is known", motion["known"]],
         [f"of these within {ACCEL_RMS_MAX_MPS2:g} m/s² and {JERK_RMS_MAX_MPS3:g} m/s³", motion["within"]],
         [f"of these with S below {REVIEW_BELOW:g}", motion["score_below"]],
-    ]  # fmt: skip
 
-
-def _read_caption_rows(record: ReleaseRecord) -> Rows:
-    captions = record.history.captions
-    return [
         ["captions read", captions.read], *_counted("captions dropped: {}", captions.dropped),
         ["captions accepted, but frame not selected", captions.frame_not_selected],
         ["captions accepted, but track not released", captions.flight_left_out],
@@ -226,25 +208,18 @@ def _fovs(numbers: Numbers) -> Rows:
     return rows
 
 
-def _times_of_day(numbers: Numbers) -> list[str]:
-    """Return the columns of `_weather`: the paper's times of day, then others that were counted."""
-    return [*TIMES, *sorted({sky.partition(TAB)[2] for sky in numbers.of("sky")} - {*TIMES})]
-
-
-def _weather(numbers: Numbers, times: list[str]) -> Rows:
-    """Return frames by preset and time of day, where a frame names one."""
+def _weather(numbers: Numbers) -> tuple[list[str], Rows]:
+    """Return head and rows: frames by preset and time of day, where a frame names one; the paper's first."""
     skies = numbers.of("sky")
-    presets = [*WEATHERS, *sorted({sky.partition(TAB)[0] for sky in skies} - {*WEATHERS})] if skies else []
-    return [[preset, *(skies[f"{preset}{TAB}{time}"] for time in times)] for preset in presets]
+    presets, times = {sky.partition(TAB)[0] for sky in skies}, {sky.partition(TAB)[2] for sky in skies}
+    columns = [*TIMES, *sorted(times - {*TIMES})]
+    names = [*WEATHERS, *sorted(presets - {*WEATHERS})] if skies else []
+    return ["preset", *columns], [[name, *(skies[f"{name}{TAB}{time}"] for time in columns)] for name in names]
 
 
 def _events(numbers: Numbers) -> Rows:
-    rows = Rows()
-    for event, count in sorted(numbers.of("events").items()):
-        # Three parts, joined by TAB; the tabs added make three also of fewer, which only a changed record has.
-        track, name, outcome = (event + 2 * TAB).split(TAB)[:3]
-        rows.append([track, name, outcome, count])
-    return rows
+    # A name has three parts, joined by TAB; two more tabs make three of any name that a changed record may have.
+    return [[*(event + 2 * TAB).split(TAB)[:3], count] for event, count in sorted(numbers.of("events").items())]
 
 
 def _decisions(numbers: Numbers) -> Rows:
@@ -257,15 +232,12 @@ def _decisions(numbers: Numbers) -> Rows:
     ]  # fmt: skip
 
 
-def _confused_tokens(numbers: Numbers) -> list[str]:
-    """Return rows and columns of `_confusion`: what occurs as a label or as a decision."""
-    counted = {name for pair in numbers.of("confusion") for name in pair.split(TAB)}
-    return [name for name in (*TOKENS, "none") if name in counted]
-
-
-def _confusion(numbers: Numbers, tokens: list[str]) -> Rows:
+def _confusion(numbers: Numbers) -> tuple[list[str], Rows]:
+    """Return head and rows, one of each for what occurs as a label or as a decision."""
     counts = numbers.of("confusion")
-    return [[label, *(counts[f"{label}{TAB}{decision}"] for decision in tokens)] for label in tokens]
+    counted = {name for pair in counts for name in pair.split(TAB)}
+    names = [name for name in (*TOKENS, "none") if name in counted]
+    return ["label", *names], [[label, *(counts[f"{label}{TAB}{other}"] for other in names)] for label in names]
 
 
 def _origin(record: ReleaseRecord) -> Rows:
@@ -299,8 +271,6 @@ STYLE = """
 def run(dataset: Path, out: Path) -> Path:
     """Read the record of a release; write `stats.json` and `stats.html`, and return the page.
 
-    The numbers are those of the record; `release verify` compares them with the rows.
-
     Raises:
         InputError: If the folder is not a release.
     """
@@ -319,7 +289,6 @@ def run(dataset: Path, out: Path) -> Path:
 
 
 def _numeric_columns(table: Table) -> list[bool]:
-    """Return for each column whether no cell is text; a page aligns its head with the numbers."""
     return [all(isinstance(row[k], int | float | None) for row in table.rows) for k in range(len(table.head))]
 
 
