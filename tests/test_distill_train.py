@@ -342,7 +342,7 @@ def test_workers_end_with_a_training_that_was_killed(tmp_path):
 def test_features_that_do_not_fit_into_the_memory_are_computed_again(place, tmp_path, monkeypatch, caplog, settings):
     """With the same losses; the first pictures that are read together are kept."""
     run(place, tmp_path / "whole", max_steps=3, **settings)
-    monkeypatch.setattr(features, "TOGETHER", 8)
+    monkeypatch.setattr(features, "PICTURES_PER_BATCH", 8)
     monkeypatch.setattr(loading, "memory_bytes", lambda: 1)
     run(place, tmp_path / "little", max_steps=3, **settings)
     assert "do not fit into the memory: they are encoded at each use" in caplog.text

@@ -38,7 +38,7 @@ from cosfly.runtime.model_json import CONTEXT_FULL
 from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, read_manifest, read_stage_record, write_failures
 from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
 from distill.student.chat import EncodedSample, prompt_batch
-from distill.student.features import PictureReader, Tensors, pictures_of, read_features, shown
+from distill.student.features import PictureReader, Tensors, pictures_of, read_features, with_encoded_pictures
 from distill.student.model import Device, Student, load_student, require, student_path, weight_files
 from distill.student.saving import check_adapter
 
@@ -190,7 +190,7 @@ def generate(
     )
     core.generation_config = config  # settings for sampling of the model folder would complete those of `config`
     student.model.eval()
-    with torch.inference_mode(), student.computing(), shown(student, pictures) as seen:
+    with torch.inference_mode(), student.computing(), with_encoded_pictures(student, pictures) as seen:
         found = core.generate(**inputs, **seen, tokenizer=student.tokenizer)
     completions = []
     for tokens in found[:, num_prompt:].tolist():

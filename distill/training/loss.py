@@ -14,7 +14,7 @@ from typing import Any
 
 from cosfly.runtime.errors import ConfigError
 from distill.student.chat import IGNORED, EncodedSample, padded
-from distill.student.features import Tensors, shown
+from distill.student.features import Tensors, with_encoded_pictures
 from distill.student.model import Student
 
 
@@ -84,7 +84,7 @@ def answer_loss(student: Student, rows: Sequence[EncodedSample], pictures: Seque
 
     given = {name: torch.from_numpy(array).to(student.device) for name, array in padded(student, rows).items()}
     labels, weights = given.pop("labels")[:, 1:], given.pop("weights")[:, 1:]
-    with student.computing(), shown(student, pictures) as inputs:
+    with student.computing(), with_encoded_pictures(student, pictures) as inputs:
         hidden = student.core.base_model(**given, **inputs, use_cache=False).last_hidden_state
     is_target = labels != IGNORED  # the token at i is predicted at i - 1
     head, hidden = student.core.get_output_embeddings().weight, hidden[:, :-1][is_target]
