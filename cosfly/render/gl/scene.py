@@ -23,9 +23,12 @@ from cosfly.render.surfaces import Solids, are_solids, layers_of, solids_of
 # with colours of their own get plain paint. The shader draws patterns in the axes of a part, so each plane of a
 # building is a part.
 
-STEEP = 0.35  # largest z of a wall's normal
-FLAT = 0.94  # least z of a flat roof's normal
+OTHER, SLOPE, WALL, FLAT_ROOF = range(4)  # surfaces: those of buildings, and OTHER for all other things
+MATERIAL_OF_SURFACE = np.array([parts.PLAIN, parts.TILES, parts.FACADE, parts.FACADE])
+WALL_Z_MAX = 0.35  # of a wall's normal
+FLAT_ROOF_Z_MIN = 0.94  # of a flat roof's normal
 SAME_ANGLE_RAD, SAME_PLACE_M = np.radians(1.0), 0.1  # surfaces that differ by less are one plane
+NUM_QUARTER_STEPS = round(np.pi / 2 / SAME_ANGLE_RAD)  # steps of SAME_ANGLE_RAD in a quarter turn
 THINNEST_M = 0.01  # half size of a flat part
 
 
@@ -39,17 +42,20 @@ def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.
     kinds = box_map.kinds[solids.rows]
     seeds = seeds_of(box_map.ids[solids.rows])
     normals = solids.normals
-    is_house = kinds == KINDS["Buildings"]
-    is_wall = is_house & (np.abs(normals[:, 2]) < STEEP)
-    is_flat = is_house & (np.abs(normals[:, 2]) > FLAT)
-    materials = np.where(is_house, np.where(is_wall | is_flat, parts.FACADE, parts.TILES), parts.PLAIN)
-    axes, part_numbers = _planes(box_map, solids, is_wall, is_flat, is_house)
-    low_m, high_m = _bounds_of_things(solids)
+    steepness = np.abs(normals[:, 2])
+    surfaces = np.where(steepness < WALL_Z_MAX, WALL, np.where(steepness > FLAT_ROOF_Z_MIN, FLAT_ROOF, SLOPE))
+    surfaces[kinds != KINDS["Buildings"]] = OTHER
+    materials = MATERIAL_OF_SURFACE[surfaces]
+    axes, part_numbers = _planes(box_map, solids, surfaces)
+    low_m, high_m = _bounds(solids.corners_m, solids.things)
     middles_m = (low_m + high_m)[solids.things] / 2.0
     # Corners in the axes of their part, from the middle of their thing; center and half: bounds of the parts there.
     local_m = np.einsum("kij,kcj->kci", axes, solids.corners_m - middles_m[:, None])
-    centers_m, halves_m = (bound[part_numbers] for bound in _bounds_of_parts(local_m, part_numbers))
+    part_low_m, part_high_m = (bound[part_numbers] for bound in _bounds(local_m, part_numbers))
+    centers_m = (part_low_m + part_high_m) / 2.0
+    halves_m = np.maximum((part_high_m - part_low_m) / 2.0, THINNEST_M)
     vertices = np.zeros((len(solids), 3), LOOSE_VERTEX)
+    # The shader scales `position` by `half`, so positions lie within -1 to 1. Normals scale inversely.
     vertices["position"] = (local_m - centers_m[:, None]) / halves_m[:, None]
     for name, values in {
         "normal": np.einsum("kij,kj->ki", axes, normals) * halves_m,
@@ -65,10 +71,10 @@ def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.
     back_sides["normal"] *= -1.0
     vertices = np.concatenate([vertices, back_sides])
     materials, things = np.tile(materials, 2), np.tile(solids.things, 2)
-    rows_of = {
-        int(material): np.lexsort((things, materials != material))[: np.count_nonzero(materials == material)]
-        for material in np.unique(materials)
-    }
+    rows_of = {}
+    for material in np.unique(materials).tolist():
+        rows = np.flatnonzero(materials == material)
+        rows_of[material] = rows[np.argsort(things[rows], kind="stable")]  # both sides of a thing are together
     return LooseTriangles(
         {material: vertices[rows].reshape(-1) for material, rows in rows_of.items()},
         {material: things[rows] for material, rows in rows_of.items()},
@@ -77,21 +83,13 @@ def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.
     )
 
 
-def _bounds_of_things(solids: Solids) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest corner of each placed mesh, (n, 3) each, world."""
-    first_rows = np.searchsorted(solids.things, np.arange(solids.things[-1] + 2))[:-1]
-    low_m = np.minimum.reduceat(solids.corners_m.min(axis=1), first_rows)
-    high_m = np.maximum.reduceat(solids.corners_m.max(axis=1), first_rows)
-    return low_m, high_m
-
-
-def _bounds_of_parts(local_m: np.ndarray, part_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre and half size of each part, (p, 3) each, from the corners (k, 3, 3) of its triangles."""
-    low_m = np.full((part_numbers.max() + 1, 3), np.inf)
+def _bounds(corners_m: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and the highest corner of the triangles (k, 3, 3) with each number (k,), (n, 3) each."""
+    low_m = np.full((numbers.max() + 1, 3), np.inf)
     high_m = -low_m
-    np.minimum.at(low_m, part_numbers, local_m.min(axis=1))
-    np.maximum.at(high_m, part_numbers, local_m.max(axis=1))
-    return (low_m + high_m) / 2.0, np.maximum((high_m - low_m) / 2.0, THINNEST_M)
+    np.minimum.at(low_m, numbers, corners_m.min(axis=1))
+    np.maximum.at(high_m, numbers, corners_m.max(axis=1))
+    return low_m, high_m
 
 
 def _painted(materials: np.ndarray, seeds: np.ndarray) -> np.ndarray:
@@ -103,43 +101,45 @@ def _painted(materials: np.ndarray, seeds: np.ndarray) -> np.ndarray:
     return colors
 
 
-def _planes(
-    box_map: BoxMap, solids: Solids, is_wall: np.ndarray, is_flat: np.ndarray, is_house: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _planes(box_map: BoxMap, solids: Solids, surfaces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the axes of the part of each triangle, (k, 3, 3) part_from_world, and the number of that part, (k,).
 
     Axes of a wall: x along it, y out, z up. Of a slope: x along its eaves, y out, z up the slope. Of a flat roof: those
     of the main direction of its house's walls, z up. Of other things: those of the box.
     """
     normals = solids.normals
-    things = solids.things
-    zero = np.zeros(len(solids))
-    around = np.round(np.arctan2(normals[:, 1], normals[:, 0]) / SAME_ANGLE_RAD).astype(np.int64)
-    slope = np.round(np.arcsin(np.clip(normals[:, 2], -1.0, 1.0)) / SAME_ANGLE_RAD)
-    tilt = np.where(is_wall, 0, slope).astype(np.int64)
-    yaw, rise = around * SAME_ANGLE_RAD, tilt * SAME_ANGLE_RAD
-    out = np.stack([np.cos(yaw) * np.cos(rise), np.sin(yaw) * np.cos(rise), np.sin(rise)], axis=1)
-    along = np.stack([np.sin(yaw), -np.cos(yaw), zero], axis=1)
+    # Directions of normals in whole steps of SAME_ANGLE_RAD: equal numbers are one direction.
+    yaw_steps = np.round(np.arctan2(normals[:, 1], normals[:, 0]) / SAME_ANGLE_RAD).astype(np.int64)
+    tilt_steps = np.round(np.arcsin(np.clip(normals[:, 2], -1.0, 1.0)) / SAME_ANGLE_RAD).astype(np.int64)
+    tilt_steps[surfaces == WALL] = 0
+    yaws_rad, tilts_rad = yaw_steps * SAME_ANGLE_RAD, tilt_steps * SAME_ANGLE_RAD
+    sine, cosine = np.sin(yaws_rad), np.cos(yaws_rad)
+    out = np.stack([cosine * np.cos(tilts_rad), sine * np.cos(tilts_rad), np.sin(tilts_rad)], axis=1)
+    along = np.stack([sine, -cosine, np.zeros_like(sine)], axis=1)
     axes = np.stack([along, out, np.cross(along, out)], axis=1)
-    # The main direction of the walls of each house, by area, in steps of SAME_ANGLE_RAD within a quarter turn.
-    quarter = round(np.pi / 2 / SAME_ANGLE_RAD)
-    edges = solids.corners_m[:, 1:] - solids.corners_m[:, :1]
-    areas = np.zeros((int(things[-1]) + 1, quarter))
-    np.add.at(areas, (things, around % quarter), np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) * is_wall)
-    main = areas.argmax(axis=1)[things] * SAME_ANGLE_RAD
-    level = [np.cos(main), np.sin(main), zero, -np.sin(main), np.cos(main), zero, zero, zero, zero + 1.0]
-    axes[is_flat] = np.stack(level, axis=1).reshape(-1, 3, 3)[is_flat]
-    turns = rotation_matrices(np.radians(box_map.rotations_deg[solids.rows])).transpose(0, 2, 1)
-    axes[~is_house] = turns[~is_house]
-    away = np.round(np.einsum("kj,kj->k", out, solids.corners_m.mean(axis=1)) / SAME_PLACE_M).astype(np.int64)
-    level_z = np.round(solids.corners_m[..., 2].mean(axis=1) / SAME_PLACE_M).astype(np.int64)
-    # The key of a part: direction, tilt and distance from the origin of a wall or slope; the height of a flat roof;
-    # any other thing is one part.
-    key = np.stack([things, 1 + is_wall + 2 * is_flat, around, tilt, away], axis=1)
-    key[is_flat, 2:4] = 0
-    key[is_flat, 4] = level_z[is_flat]
-    key[~is_house, 1:] = 0
+    is_flat, is_other = surfaces == FLAT_ROOF, surfaces == OTHER
+    axes[is_flat] = _main_axes(solids, surfaces == WALL, yaw_steps)[is_flat]
+    box_axes = rotation_matrices(np.radians(box_map.rotations_deg[solids.rows])).transpose(0, 2, 1)
+    axes[is_other] = box_axes[is_other]
+    middles_m = solids.corners_m.mean(axis=1)
+    # Distance of the plane from the origin. A flat roof counts by its height, since it is not quite level.
+    away_m = np.where(is_flat, middles_m[:, 2], np.einsum("kj,kj->k", out, middles_m))
+    away_steps = np.round(away_m / SAME_PLACE_M).astype(np.int64)
+    key = np.stack([solids.things, surfaces, yaw_steps, tilt_steps, away_steps], axis=1)
+    key[is_flat, 2:4] = 0  # all directions of a flat roof are one
+    key[is_other, 2:] = 0  # any other thing is one part
     return axes, np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _main_axes(solids: Solids, is_wall: np.ndarray, yaw_steps: np.ndarray) -> np.ndarray:
+    """Return level axes along the walls of each triangle's house, by the direction of most wall area, (k, 3, 3)."""
+    edges = solids.corners_m[:, 1:] - solids.corners_m[:, :1]
+    wall_areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) * is_wall  # twice the areas
+    areas = np.zeros((int(solids.things[-1]) + 1, NUM_QUARTER_STEPS))  # walls at right angles have one direction
+    np.add.at(areas, (solids.things, yaw_steps % NUM_QUARTER_STEPS), wall_areas)
+    yaws_rad = areas.argmax(axis=1)[solids.things] * SAME_ANGLE_RAD
+    sine, cosine, zero = np.sin(yaws_rad), np.cos(yaws_rad), np.zeros(len(solids))
+    return np.stack([cosine, sine, zero, -sine, cosine, zero, zero, zero, zero + 1.0], axis=1).reshape(-1, 3, 3)
 
 
 # --- lamps ------------------------------------------------------------------------------------------------------------
