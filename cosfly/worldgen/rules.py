@@ -290,10 +290,8 @@ class _Reader:
             group = {"name": name, "count": count, "footprint_m": footprint_m, "heights_m": heights_m}
             self.plan["buildings"].append(group)
             is_main = not row.get("landmark") or name in _words(settlement.get("consists_of", ""))
-            if count is not None and is_main and (count > 1 or len(self.buildings) == 1):
+            if None not in self.buildings.values() and is_main and (count != 1 or len(self.buildings) == 1):
                 self.plan["only_these"] = True
-        if None in self.buildings.values():
-            self.plan["only_these"] = False
         if self.plan["only_these"] and not has_open:
             self.plan |= {"plazas": 0, "greens": 0}
 
