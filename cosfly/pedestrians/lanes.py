@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import combinations, pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,10 +25,17 @@ CAR_MIDDLE_M = 1.2  # height above the ground at which obstacles are looked for
 LANE_SHARES = (0.25, 0.15, 0.08)  # of the width, from the middle line to the lane; smaller where cars are parked
 SHORTEST_LANE_M = 8.0
 BEFORE_CURVE_M = 1.5  # from the start of a curve to the crossing carriageway
+BEFORE_DEAD_END_M = 3.0  # from the end of a lane to the end of its street
+CROSSING_SINE_MIN = 0.2  # of the angle of streets that cross, 12 degrees; others can only be in one line
 SAME_PLACE_M = 3.0
+DEAD_END = -1  # in place of a junction's number
 
 IsFree = Callable[[np.ndarray], bool]  # whether a car can pass all of these positions, (n, 2) m
-Station = tuple[float, int]  # m along a street, and the number of the junction there, -1 for a dead end
+
+
+class Station(NamedTuple):
+    along_m: float  # from the start of its street
+    junction: int  # its number, or DEAD_END
 
 
 @dataclass(frozen=True)
@@ -40,10 +48,10 @@ class Street:
     width_m: float
     reach_m: tuple[float, float]  # how far the road extends before 0 and after length_m
 
-    def at(self, along_m: float) -> np.ndarray:
+    def position_m(self, along_m: float) -> np.ndarray:
         return self.start_m + along_m * self.direction
 
-    def reaches(self, along_m: float) -> bool:
+    def has_road_at(self, along_m: float) -> bool:
         return -self.reach_m[0] <= along_m <= self.length_m + self.reach_m[1]
 
 
@@ -75,18 +83,15 @@ def lanes_of(box_map: BoxMap) -> list[Lane]:
         is_clear = signed_distances(obstacles, places, CLEAR_M)[0] >= CLEAR_M
         return bool(_on_road(roads, points_m).all() and is_clear.all())
 
-    widths_m, stations = _junctions(streets)
-    lanes = [
-        lane
-        for street, along in zip(streets, stations, strict=True)
-        for low, high in pairwise(along)
-        for way in ((low, high), (high, low))
-        if (lane := _lane(street, *way, widths_m, is_free)) is not None
-    ]
+    widths_m, stations_of_streets = _junctions(streets)
+    lanes: list[Lane] = []
+    for street, stations in zip(streets, stations_of_streets, strict=True):
+        for low, high in pairwise(stations):
+            lanes += filter(None, (_lane(street, *ends, widths_m, is_free) for ends in ((low, high), (high, low))))
     for lane in lanes:
         for number, after in enumerate(lanes):
             is_back = after.street is lane.street and after.last == lane.first  # cars do not turn on the spot
-            if lane.last[1] >= 0 and after.first[1] == lane.last[1] and not is_back:
+            if after.first.junction == lane.last.junction != DEAD_END and not is_back:
                 curve = _curve(lane.points_m, after.points_m)
                 if is_free(curve):
                     lane.onward.append((number, curve))
@@ -131,37 +136,38 @@ def _junctions(streets: list[Street]) -> tuple[list[float], list[list[Station]]]
     """Return the width of the widest street of each junction, m, and the stations of each street in order."""
     places_m: list[np.ndarray] = []
     widths_m: list[float] = []
-    stations: list[dict[int, float]] = [{} for _ in streets]
-    for (i, one), (j, two) in combinations(enumerate(streets), 2):
-        meeting = _meeting(one, two)
-        if meeting is not None:
-            place_m = one.at(meeting[0])
-            near = (k for k, other_m in enumerate(places_m) if np.linalg.norm(other_m - place_m) < SAME_PLACE_M)
-            number = next(near, len(places_m))
-            if number == len(places_m):
+    along_of_streets: list[dict[int, float]] = [{} for _ in streets]  # m by junction
+    for (i, street), (j, other) in combinations(enumerate(streets), 2):
+        meeting_m = _meeting(street, other)
+        if meeting_m is not None:
+            place_m = street.position_m(meeting_m[0])
+            near = (k for k, known_m in enumerate(places_m) if np.linalg.norm(known_m - place_m) < SAME_PLACE_M)
+            junction = next(near, len(places_m))
+            if junction == len(places_m):
                 places_m.append(place_m)
                 widths_m.append(0.0)
-            widths_m[number] = max(widths_m[number], one.width_m, two.width_m)
-            stations[i].setdefault(number, meeting[0])
-            stations[j].setdefault(number, meeting[1])
+            widths_m[junction] = max(widths_m[junction], street.width_m, other.width_m)
+            along_of_streets[i].setdefault(junction, meeting_m[0])
+            along_of_streets[j].setdefault(junction, meeting_m[1])
     ordered_stations = []
-    for street, along_of in zip(streets, stations, strict=True):
-        ordered = sorted((along_m, number) for number, along_m in along_of.items())
-        if not ordered or ordered[0][0] > street.width_m:
-            ordered.insert(0, (0.0, -1))
-        if ordered[-1][0] < street.length_m - street.width_m:
-            ordered.append((street.length_m, -1))
-        ordered_stations.append(ordered)
+    for street, along_of in zip(streets, along_of_streets, strict=True):
+        stations = sorted(Station(along_m, junction) for junction, along_m in along_of.items())
+        if not stations or stations[0].along_m > street.width_m:
+            stations.insert(0, Station(0.0, DEAD_END))
+        if stations[-1].along_m < street.length_m - street.width_m:
+            stations.append(Station(street.length_m, DEAD_END))
+        ordered_stations.append(stations)
     return widths_m, ordered_stations
 
 
 def _lane(street: Street, first: Station, last: Station, widths_m: list[float], is_free: IsFree) -> Lane | None:
     """Return the lane on the right between two stations, as far from the middle as it is free; None if blocked."""
-    sign = np.sign(last[0] - first[0])
-    start, end = (
-        along + toward * sign * (widths_m[number] / 2.0 + BEFORE_CURVE_M if number >= 0 else 3.0)
-        for toward, (along, number) in ((1.0, first), (-1.0, last))
+    sign = np.sign(last.along_m - first.along_m)
+    after_first_m, before_last_m = (
+        BEFORE_DEAD_END_M if junction == DEAD_END else widths_m[junction] / 2.0 + BEFORE_CURVE_M
+        for junction in (first.junction, last.junction)
     )
+    start, end = first.along_m + sign * after_first_m, last.along_m - sign * before_last_m
     if sign * (end - start) < SHORTEST_LANE_M:
         return None
     direction = sign * street.direction
@@ -172,42 +178,42 @@ def _lane(street: Street, first: Station, last: Station, widths_m: list[float], 
     return next((Lane(line, street, first, last) for line in lines if is_free(line)), None)
 
 
-def _meeting(one: Street, two: Street) -> tuple[float, float] | None:
+def _meeting(street: Street, other: Street) -> tuple[float, float] | None:
     """Return where two streets meet, m along each; None if they do not meet."""
-    sine = _cross(one.direction, two.direction)
-    apart = two.start_m - one.start_m
-    if abs(sine) > 0.2:
-        meeting = _cross(apart, two.direction) / sine, _cross(apart, one.direction) / sine
+    sine = _cross(street.direction, other.direction)
+    offset_m = other.start_m - street.start_m
+    if abs(sine) > CROSSING_SINE_MIN:
+        meeting_m = _cross(offset_m, other.direction) / sine, _cross(offset_m, street.direction) / sine
     else:
-        meeting = _in_line(one, two)
-    return meeting if one.reaches(meeting[0]) and two.reaches(meeting[1]) else None
+        meeting_m = _in_line(street, other)
+    return meeting_m if street.has_road_at(meeting_m[0]) and other.has_road_at(meeting_m[1]) else None
 
 
-def _in_line(one: Street, two: Street) -> tuple[float, float]:
+def _in_line(street: Street, other: Street) -> tuple[float, float]:
     """Return the middle of the gap between two streets in one line, m along each; else infinity."""
-    ends = np.array([(two.at(along) - one.start_m) @ one.direction for along in (0.0, two.length_m)])
-    aside_m = abs(_cross(one.direction, two.start_m - one.start_m))
-    if aside_m > SAME_PLACE_M or (ends.min() < one.length_m and ends.max() > 0.0):
+    ends_m = np.array([(other.position_m(m) - street.start_m) @ street.direction for m in (0.0, other.length_m)])
+    aside_m = abs(_cross(street.direction, other.start_m - street.start_m))
+    if aside_m > SAME_PLACE_M or (ends_m.min() < street.length_m and ends_m.max() > 0.0):
         return np.inf, np.inf
-    after = ends.min() >= one.length_m
-    middle = float(one.length_m + ends.min() if after else ends.max()) / 2.0
-    return middle, float((one.at(middle) - two.start_m) @ two.direction)
+    is_after = ends_m.min() >= street.length_m
+    middle_m = float(street.length_m + ends_m.min() if is_after else ends_m.max()) / 2.0
+    return middle_m, float((street.position_m(middle_m) - other.start_m) @ other.direction)
 
 
-def _cross(one: np.ndarray, two: np.ndarray) -> float:
-    return float(one[0] * two[1] - one[1] * two[0])
+def _cross(a: np.ndarray, b: np.ndarray) -> float:
+    return float(a[0] * b[1] - a[1] * b[0])
 
 
-def _curve(one_m: np.ndarray, two_m: np.ndarray) -> np.ndarray:
+def _curve(lane_m: np.ndarray, next_m: np.ndarray) -> np.ndarray:
     """Return a curve from the end of a lane to the start of another, tangent to both, (j, 2) m without its two ends.
 
-    A cubic Bezier: its inner points lie on the lanes' lines, at 0.55 of the distance of a quarter circle.
+    A cubic Bezier: its inner points lie on the lanes' lines, at 0.55 of the radius of the quarter circle of this chord.
     """
-    start, end = one_m[-1], two_m[0]
-    leave, arrive = one_m[-1] - one_m[-2], two_m[1] - two_m[0]
+    start, end = lane_m[-1], next_m[0]
+    leave, arrive = lane_m[-1] - lane_m[-2], next_m[1] - next_m[0]
     gap_m = float(np.linalg.norm(end - start))
     pull = 0.55 * gap_m / np.sqrt(2.0)
     a, b = start + pull * leave / np.linalg.norm(leave), end - pull * arrive / np.linalg.norm(arrive)
-    t = np.linspace(0.0, 1.0, max(4, int(1.2 * gap_m / STEP_M)))[1:-1, None]
+    t = np.linspace(0.0, 1.0, max(4, int(1.2 * gap_m / STEP_M)))[1:-1, None]  # an arc is up to 1.2 chords
     u = 1.0 - t
     return u**3 * start + 3 * u**2 * t * a + 3 * u * t**2 * b + t**3 * end
