@@ -80,7 +80,7 @@ def test_goals_are_all_cells_of_the_part_at_the_wanted_distance(start):
         for y, x in np.argwhere(parts == 2).tolist()
         if 2.5 <= np.hypot(x - start[0], y - start[1]) <= 5.0
     }  # fmt: skip
-    drawn = [ground_in(parts).sample_goal(start, 2.5, 5.0, rng) for _ in range(200 * len(expected))]
+    drawn = [ground_in(parts).sample_goals(start, 2.5, 5.0, rng)[0] for _ in range(200 * len(expected))]
     assert set(drawn) == expected
     counts = np.unique(np.array(drawn), axis=0, return_counts=True)[1]
     assert abs(counts - 200).max() < 75  # 5 standard deviations

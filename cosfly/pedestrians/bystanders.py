@@ -37,7 +37,7 @@ TURN_S = 2.0  # stop of bystanders at the end of their route, before they walk b
 PASS_M = (1.5, 7.0)  # distance from the target when it is passed
 OPPOSITE_TRIES = 6  # second ends of a route that are drawn, for the one most opposite to the first end
 GOLDEN = 0.618034  # moments k * GOLDEN % 1 are spread evenly for any number of them
-OWN_SPEED = (0.8, 1.2)  # factor on the speeds of the pace
+SPEED_FACTORS = (0.8, 1.2)  # bounds of the factor on the speeds of a pace, or of cars
 CAR_SPEED_MPS = 8.0  # 30 km/h
 CAR_SIDEWAYS_MPS2, CAR_FORWARD_MPS2 = 2.0, 2.0  # comfortable accelerations in a curve, and along the route
 SHORTEST_DRIVE_M = 15.0
@@ -48,8 +48,8 @@ CHORD_M = 1.0  # a car's heading is that of the chord from this far behind to th
 class Trip:
     """The route of a bystander or car with its stops.
 
-    kind: a key of BUILDS. limits_mps: (k,) speeds at the waypoints, apart from stops. head_start_s: time on the route
-    before the pedestrian trajectory begins.
+    kind: a key of BUILDS. route: its k waypoints. limits_mps: (k,) speeds there, apart from stops. head_start_s: time
+    on the route before the pedestrian trajectory begins.
     """
 
     kind: str
@@ -57,27 +57,27 @@ class Trip:
     limits_mps: np.ndarray
     head_start_s: float = 0.0
 
-    def moved(self, along_m: np.ndarray, time_s: np.ndarray, ground_z_m: float) -> Bystander:
+    def motion(self, along_m: np.ndarray, time_s: np.ndarray, ground_z_m: float) -> Bystander:
         """Return the positions and headings at distances along the route, (n,) m, which are reached at times (n,)."""
-        positions_m = self.at(along_m)
+        positions_m = self.positions_at(along_m)
         if self.kind == "Car":
-            chord = self.at(along_m + CHORD_M) - self.at(along_m - CHORD_M)
-            headings_rad = np.arctan2(chord[:, 1], chord[:, 0])
+            chords_m = self.positions_at(along_m + CHORD_M) - self.positions_at(along_m - CHORD_M)
+            headings_rad = np.arctan2(chords_m[:, 1], chords_m[:, 0])
         else:
             headings_rad = headings_of(positions_m, time_s)
         return Bystander(self.kind, np.insert(positions_m, 2, ground_z_m, axis=1), headings_rad)
 
     @cached_property
-    def timed(self) -> TimedRoute:
+    def timed_distances(self) -> TimedRoute:
         """Return the distances along the route as a route of one dimension, with the speeds at its waypoints."""
         speeds_mps = np.where(self.route.stops_s > 0, 0.0, self.limits_mps)
         if self.kind == "Car":
             speeds_mps = braked(speeds_mps, self.route.along_m)
         return TimedRoute(self.route.along_m[:, None], speeds_mps, self.route.stops_s)
 
-    def along_m(self, time_s: np.ndarray) -> np.ndarray:
+    def distances_at(self, time_s: np.ndarray) -> np.ndarray:
         """Return the distance along the route at each time, (n,) m."""
-        return self.timed.sample(time_s + self.head_start_s)[0][:, 0]
+        return self.timed_distances.sample(time_s + self.head_start_s)[0][:, 0]
 
     def waiting(self, before_m: float) -> Trip:
         """Return the trip with a stop of WAIT_S, or a longer one, at least KEEP_BACK_M before a place of the route."""
@@ -85,13 +85,14 @@ class Trip:
         waypoint = max(0, int(np.searchsorted(self.route.along_m, stop_m, side="right")) - 1)
         first_near = max(0, waypoint - STOP_GAP_MIN + 1)
         stops_s = self.route.stops_s.copy()
+        # Stops need STOP_GAP_MIN waypoints between them, so that a stop nearby becomes longer instead.
         stops_near_s = stops_s[first_near : waypoint + STOP_GAP_MIN]
         if stops_near_s.any():
             waypoint = first_near + int(np.argmax(stops_near_s))
         stops_s[waypoint] += WAIT_S
         return replace(self, route=replace(self.route, stops_s=stops_s))
 
-    def at(self, along_m: np.ndarray) -> np.ndarray:
+    def positions_at(self, along_m: np.ndarray) -> np.ndarray:
         """Return the positions at distances along the route, (n, 2) m."""
         route = self.route
         return np.column_stack([np.interp(along_m, route.along_m, route.polyline_m[:, k]) for k in (0, 1)])
@@ -114,8 +115,8 @@ def bystanders_of(
 ) -> Bystanders:  # fmt: skip
     """Place the bystanders and cars around one pedestrian trajectory."""
     placed = [Bystander("Pedestrians", target.positions_m, headings_of(target.positions_m, target.time_s))]
-    for kind, wanted in (("Pedestrians", cfg.others), ("Car", cfg.traffic)):
-        for number in range(wanted):
+    for kind, num_wanted in (("Pedestrians", cfg.others), ("Car", cfg.traffic)):
+        for number in range(num_wanted):
             for _ in range(cfg.num_retries + 1):
                 is_car = kind == "Car"
                 if is_car:
@@ -132,8 +133,8 @@ def bystanders_of(
 def avoid_collisions(trip: Trip, time_s: np.ndarray, placed: list[Bystander], ground_z_m: float) -> Bystander | None:
     """Return the motion of a trip that waits for those already placed; None where waiting does not help."""
     for _ in range(MOST_WAITS + 1):
-        along_m = trip.along_m(time_s)
-        bystander = trip.moved(along_m, time_s, ground_z_m)
+        along_m = trip.distances_at(time_s)
+        bystander = trip.motion(along_m, time_s, ground_z_m)
         collisions = np.flatnonzero(gaps_m(bystander, placed) < 0.0)
         if len(collisions) == 0:
             return bystander
@@ -148,35 +149,33 @@ def _draw_pedestrian(
     target: PedestrianTrajectory, number: int, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator
 ) -> Trip | None:
     """Draw a bystander's route that passes the target, back and forth for the duration; None if there is none."""
-    moment_s = number * GOLDEN % 1.0 * float(target.time_s[-1])
-    x, y = ground.grid.cells_at(target.positions_m[int(np.searchsorted(target.time_s, moment_s))])
-    low, high = np.array(PASS_M) / cfg.resolution_m
-    place = ground.sample_goal((int(x), int(y)), low, high, rng)
-    if place is None:
+    pass_time_s = number * GOLDEN % 1.0 * float(target.time_s[-1])
+    x, y = ground.grid.cells_at(target.positions_m[int(np.searchsorted(target.time_s, pass_time_s))])
+    low_cells, high_cells = np.array(PASS_M) / cfg.resolution_m
+    places = ground.sample_goals((int(x), int(y)), low_cells, high_cells, rng)
+    if not places:
         return None
+    place = places[0]
     reach_cells = cfg.others_reach_m / cfg.resolution_m
-    goals = ground.sample_goals(place, 0.5 * reach_cells, reach_cells, 1 + OPPOSITE_TRIES, rng)
+    goals = ground.sample_goals(place, 0.5 * reach_cells, reach_cells, rng, 1 + OPPOSITE_TRIES)
     if not goals:
         return None
-    first = np.subtract(goals[0], place)
-
-    def cosine_to_first(goal: tuple[int, int]) -> float:  # up to a constant factor
-        offset = np.subtract(goal, place)
-        return offset @ first / np.linalg.norm(offset)
-
+    offsets = np.subtract(goals, place)
+    cosines = offsets[1:] @ offsets[0] / np.linalg.norm(offsets[1:], axis=1)  # to the first, up to a constant factor
     leg_back = ground.route(place, goals[0])
-    leg_ahead = ground.route(place, min(goals[1:], key=cosine_to_first))
+    leg_ahead = ground.route(place, goals[1 + int(np.argmin(cosines))])
     cells = np.concatenate([leg_back[:0:-1], leg_ahead])
     pace = PACES[draw_by_share(cfg.pace, rng)]
     route = take_pace(ground.grid.centers_of(cells), pace, rng)
-    trip = Trip("Pedestrians", route, speeds_at(route, pace, cfg, rng) * rng.uniform(*OWN_SPEED))
-    # The head start is at most the time of the trajectory, so that this is more than enough.
-    while trip.along_m(3.0 * target.time_s[-1:])[0] >= trip.route.along_m[-1]:
+    trip = Trip("Pedestrians", route, speeds_at(route, pace, cfg, rng) * rng.uniform(*SPEED_FACTORS))
+    # Long enough for the trajectory after a head start of at most its duration; 3 durations are more than the two.
+    while trip.distances_at(3.0 * target.time_s[-1:])[0] >= trip.route.along_m[-1]:
         trip = _with_return(trip)
-    times_s = moment_s + np.arange(0.0, target.time_s[-1], target.time_s[1])
-    apart_m = trip.at(trip.along_m(times_s)) - ground.grid.centers_of(np.array(place))
-    away_m = np.linalg.norm(apart_m, axis=1)
-    return replace(trip, head_start_s=float(times_s[np.argmin(away_m)]) - moment_s)
+    # The head start moves the nearest pass to the time of this bystander.
+    times_s = pass_time_s + np.arange(0.0, target.time_s[-1], target.time_s[1])  # time_s[1] is the step
+    offsets_m = trip.positions_at(trip.distances_at(times_s)) - ground.grid.centers_of(np.array(place))
+    nearest = np.argmin(np.linalg.norm(offsets_m, axis=1))
+    return replace(trip, head_start_s=float(times_s[nearest]) - pass_time_s)
 
 
 def _with_return(trip: Trip) -> Trip:
@@ -215,23 +214,25 @@ def _draw_car(
     if route.along_m[-1] < SHORTEST_DRIVE_M:
         return None
     curvatures = np.maximum(menger_curvature(route.polyline_m), 1e-6)
-    limits_mps = np.minimum(CAR_SPEED_MPS * rng.uniform(*OWN_SPEED), np.sqrt(CAR_SIDEWAYS_MPS2 / curvatures))
+    limits_mps = np.minimum(CAR_SPEED_MPS * rng.uniform(*SPEED_FACTORS), np.sqrt(CAR_SIDEWAYS_MPS2 / curvatures))
     limits_mps[-1] = 0.0
     return Trip("Car", route, limits_mps)
 
 
-def gaps_m(one: Bystander, others: Sequence[Bystander]) -> np.ndarray:
+def gaps_m(bystander: Bystander, placed: Sequence[Bystander]) -> np.ndarray:
     """Return the least gap between the discs of a bystander and of others in each time step, (n - 1,) m.
 
     It is negative where they overlap. All move straight within a step, so a distance of two discs is that of the origin
     from a segment of offsets.
     """
-    discs_m = np.concatenate([other.discs_m for other in others], axis=1)
-    radii_m = np.repeat([other.build.disc_radius_m for other in others], [other.discs_m.shape[1] for other in others])
-    # Time last: reductions over an axis of two numbers are slow where it is the last.
-    apart = np.ascontiguousarray((one.discs_m[:, :, None] - discs_m[:, None]).T)  # (2, e, d, n)
-    start, along = apart[..., :-1], np.diff(apart)
+    discs_m = np.concatenate([other.discs_m for other in placed], axis=1)
+    radii_m = np.repeat([other.build.disc_radius_m for other in placed], [other.discs_m.shape[1] for other in placed])
+    # (2, e, d, n): e discs of the others, d of the bystander, n times. Time is last, because reductions over an axis of
+    # two numbers are slow where it is the last.
+    offsets_m = np.ascontiguousarray((bystander.discs_m[:, :, None] - discs_m[:, None]).T)
+    start, along = offsets_m[..., :-1], np.diff(offsets_m)
     squared = np.maximum((along**2).sum(axis=0), 1e-12)
     share = np.clip(-(start * along).sum(axis=0) / squared, 0.0, 1.0)
-    nearest = np.linalg.norm(start + share * along, axis=0)
-    return (nearest.min(axis=1) - one.build.disc_radius_m - radii_m[:, None]).min(axis=0)
+    distances_m = np.linalg.norm(start + share * along, axis=0)  # (e, d, n - 1)
+    nearest_m = distances_m.min(axis=1) - bystander.build.disc_radius_m
+    return (nearest_m - radii_m[:, None]).min(axis=0)

@@ -93,12 +93,12 @@ def _draw_route(
     for _ in range(cfg.num_retries + 1):
         with timed(seconds, "sample"):
             start = ground.sample_start(rng)
-            goal = ground.sample_goal(start, *limits, rng)
-        if goal is None:
+            goals = ground.sample_goals(start, *limits, rng)
+        if not goals:
             retries["no_goal"] += 1
             continue
         with timed(seconds, "astar"):
-            cells = ground.route(start, goal)
+            cells = ground.route(start, goals[0])
         if route_cost(cells) > cfg.max_detour * np.hypot(*(cells[-1] - cells[0])):
             retries["detour"] += 1
             continue

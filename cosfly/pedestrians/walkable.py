@@ -44,7 +44,7 @@ ROI_SHARE_MIN = 0.5  # of a region of interest that lies on the map; below, it b
 MARKED_M = GAP_M = 2.0
 
 NUM_FOOTINGS = 4
-PAVED, OPEN, CROSSING, ROAD = range(NUM_FOOTINGS)
+PAVED, OPEN, CROSSING, ROAD = range(NUM_FOOTINGS)  # those below CROSSING are off the carriageway
 OF_KIND = np.full(256, OPEN, dtype=np.uint8)
 OF_KIND[[KINDS["Sidewalks"], KINDS["Ground"]]] = PAVED
 OF_KIND[[KINDS["Roads"], KINDS["RailTrack"]]] = ROAD
@@ -161,19 +161,13 @@ class WalkableGround:
 
     def sample_start(self, rng: np.random.Generator) -> tuple[int, int]:
         """Draw one cell of `may_end`, (x index, y index), uniformly."""
-        drawn = int(rng.integers(self.row_ends[-1]))
+        drawn = int(rng.integers(self.row_ends[-1]))  # in row-major order
         y = int(np.searchsorted(self.row_ends, drawn, side="right"))
         columns = np.flatnonzero(self.may_end[y])
-        return int(columns[drawn - self.row_ends[y]]), y  # counted from the row's end: a negative index
-
-    def sample_goal(
-        self, start: tuple[int, int], min_cells: float, max_cells: float, rng: np.random.Generator
-    ) -> tuple[int, int] | None:
-        """Draw one cell as `sample_goals`; None if there is none."""
-        return next(iter(self.sample_goals(start, min_cells, max_cells, 1, rng)), None)
+        return int(columns[len(columns) - (self.row_ends[y] - drawn)]), y
 
     def sample_goals(
-        self, start: tuple[int, int], min_cells: float, max_cells: float, num: int, rng: np.random.Generator
+        self, start: tuple[int, int], min_cells: float, max_cells: float, rng: np.random.Generator, num: int = 1
     ) -> list[tuple[int, int]]:
         """Draw cells of `may_end` in the start's part, (x index, y index), uniformly; none if there are none.
 
@@ -245,14 +239,11 @@ def walkable_ground(
     }  # fmt: skip
     _check_walkable(counts, where, roi_where)
     with timed(seconds, "connectivity"):
-        parts = _parts_of_large_components(free, cfg.min_component_cells, counts, where if roi is None else roi_where)
-    if num_left_out := counts["cells_walkable"] - counts["cells_used"]:
-        num_areas = counts["components"] - counts["components_used"]
-        text = "%s: %d walkable cells in areas below pedestrians.min_component_cells=%d are not used (areas: %d)"
-        log.info(text, where, num_left_out, cfg.min_component_cells, num_areas)
+        parts, component_counts = _parts_of_large_components(free, cfg, where, where if roi is None else roi_where)
     with timed(seconds, "footing"):
         costs = costs_of(cfg.road_cost)
         footing = footing_of(box_map, grid)
+    counts |= component_counts
     ground = WalkableGround(grid, inflated, parts, footing, box_map.ground_z_m, costs, is_in_roi, counts)
     if not ground.row_ends[-1]:
         raise NoPathError(
@@ -303,23 +294,28 @@ def _surface(box_map: BoxMap, ground: str, grid: grids.OccupancyGrid, free: np.n
 
 
 def _parts_of_large_components(
-    free: np.ndarray, min_component_cells: int, counts: dict[str, Any], where: str | Path
-) -> np.ndarray:
-    """Label the parts of the large components; add the component counts."""
+    free: np.ndarray, cfg: PedestriansConfig, where: str | Path, error_where: str | Path
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Label the parts of the large components; return them and the counts of components; log the small ones."""
     components, sizes = grids.connected_parts(free, 8)
-    is_large = sizes >= min_component_cells
+    is_large = sizes >= cfg.min_component_cells
     if not is_large.any():
         raise NoPathError(
-            "no connected walkable area is large enough", where=where,
+            "no connected walkable area is large enough", where=error_where,
             got=f"{int(sizes.max())} cells in the largest of {len(sizes) - 1} areas",
-            expected=f"at least {min_component_cells} cells (pedestrians.min_component_cells)",
+            expected=f"at least {cfg.min_component_cells} cells (pedestrians.min_component_cells)",
             fix="lower pedestrians.min_component_cells or pedestrians.safety_radius_m, or widen the region of interest",
         )  # fmt: skip
     parts, part_sizes = grids.connected_parts(is_large[components], 4)
     used = sorted(sizes[is_large].tolist(), reverse=True)
-    counts.update(components=len(sizes) - 1, components_used=len(used), component_sizes_used=used)
-    counts.update(cells_used=sum(used), parts=len(part_sizes) - 1)
-    return parts
+    num_components, num_cells = len(sizes) - 1, sum(used)
+    if num_unused := _count(free) - num_cells:
+        text = "%s: %d walkable cells in areas below pedestrians.min_component_cells=%d are not used (areas: %d)"
+        log.info(text, where, num_unused, cfg.min_component_cells, num_components - len(used))
+    return parts, {
+        "components": num_components, "components_used": len(used), "component_sizes_used": used,
+        "cells_used": num_cells, "parts": len(part_sizes) - 1,
+    }  # fmt: skip
 
 
 def check_roi(roi: Roi, box_map: BoxMap, where: str | Path, *, refuse: bool = False) -> None:
@@ -381,13 +377,11 @@ def _morphed(mask: np.ndarray, operation: int, width_m: float, grid: grids.Occup
 
 def costs_of(road_cost: int) -> np.ndarray:
     """Return the cost of a step of one cell on each footing, (NUM_FOOTINGS,) int64, at least 1."""
-    costs = np.ones(NUM_FOOTINGS, dtype=np.int64)
-    costs[ROAD] = road_cost
-    return costs
+    return np.where(np.arange(NUM_FOOTINGS) == ROAD, road_cost, 1)
 
 
 def count_on_road(path: PedestrianTrajectory, footing: np.ndarray, grid: grids.OccupancyGrid) -> tuple[int, int]:
     """Count a trajectory's points on carriageway away from crossings, and on crossings."""
     x, y = grid.cells_at(path.positions_m).T
     under = footing[y, x]
-    return int(np.count_nonzero(under == ROAD)), int(np.count_nonzero(under == CROSSING))
+    return _count(under == ROAD), _count(under == CROSSING)
