@@ -40,8 +40,8 @@ ENCODER_THREADS = 2  # of each worker, next to the drawing
 FRAMES_AHEAD = 6  # drawn but not written yet: bounds the memory (about 10 MB each)
 TOUCH_M = 0.01  # a camera this deep in a box still touches it only
 MOST_GOAL_FRAMES = 8  # the first in which the target is legible
-# Two appearances differ to the eye if enough pixels of the person differ in colour.
 GOAL_LEAST_PX = 24  # a goal in words names what at least this many pixels show
+# Two appearances differ to the eye if enough pixels of the person differ in colour.
 DIFFERENT_SHARE = 0.04  # least share of the person's pixels
 DIFFERENT_CONTRAST = 10.0  # least difference of a pixel (CIE76)
 
@@ -68,16 +68,19 @@ def check_track(trace: DroneTrace, surroundings: Surroundings) -> None:
     """Check that in all frames the camera is outside every obstacle and the person not below the ground."""
     depths_m = -signed_distances(surroundings.obstacles, trace.positions_m, 0.0)[0]
     below_m = np.array([surroundings.below_ground_m(place) for place in trace.targets_m - [0.0, 0.0, TARGET_HEIGHT_M]])
-    fix_path = "generate the pedestrian trajectory again on this map"
-    for what, deep_m, most_m, expected, fix in (
-        ("a camera is inside a box", depths_m, TOUCH_M, "a camera outside all boxes", "plan again on this map"),
-        ("the target is under the ground", below_m, STEP_UP_M, "feet on the ground", fix_path),
-    ):
-        is_too_deep = deep_m > most_m
-        if is_too_deep.any():
-            i = int(np.argmax(is_too_deep))
-            got = f"{deep_m[i]:.2f} m deep; this occurs in {np.count_nonzero(is_too_deep)} of {len(is_too_deep)} frames"
-            raise RenderError(what, where=f"{trace.path_id}: frame {i}", got=got, expected=expected, fix=fix)
+    fix = "plan again on this map"
+    _refuse_deep(trace, depths_m, TOUCH_M, "a camera is inside a box", expected="a camera outside all boxes", fix=fix)
+    fix = "generate the pedestrian trajectory again on this map"
+    _refuse_deep(trace, below_m, STEP_UP_M, "the target is under the ground", expected="feet on the ground", fix=fix)
+
+
+def _refuse_deep(trace: DroneTrace, depths_m: np.ndarray, limit_m: float, what: str, **advice: str) -> None:
+    """Raise RenderError with the first frame whose depth, of (n,), is above the limit."""
+    is_too_deep = depths_m > limit_m
+    if is_too_deep.any():
+        i = int(np.argmax(is_too_deep))
+        got = f"{depths_m[i]:.2f} m deep; this occurs in {np.count_nonzero(is_too_deep)} of {len(is_too_deep)} frames"
+        raise RenderError(what, where=f"{trace.path_id}: frame {i}", got=got, **advice)
 
 
 def render_track(renderer: Renderer, script: TrackScript, folder: Path, cfg: RenderConfig) -> Track:
@@ -88,7 +91,7 @@ def render_track(renderer: Renderer, script: TrackScript, folder: Path, cfg: Ren
     Returns:
         The track as it was written.
     """
-    script = replace(script, perturbed=copy.deepcopy(script.perturbed))  # dropped shifts change it
+    script = replace(script, perturbed=copy.deepcopy(script.perturbed))  # `_draw_frames` changes it
     poses = script.perturbed.poses
     places = np.concatenate([poses.positions_m, poses.targets_m])
     weather = None if script.weather is None else script.weather.params
@@ -132,7 +135,7 @@ class DrawnFrames(NamedTuple):
 
 
 def _draw_frames(renderer: Renderer, script: TrackScript, folder: Path, cfg: RenderConfig) -> DrawnFrames:
-    """Draw and write all frames; encode in threads while the next ones are drawn."""
+    """Draw and write all frames, encoding in threads; drop shifts that hide the target from `script.perturbed`."""
     perturbed = script.perturbed
     people = script.bystanders.people(script.clothes.looks) if renderer.dresses else None
     drawn = DrawnFrames([], [], [], {})
@@ -165,7 +168,7 @@ def _draw_frames(renderer: Renderer, script: TrackScript, folder: Path, cfg: Ren
     return drawn
 
 
-def draw_frame(renderer: Renderer, script: TrackScript, i: int, poses: Poses, threshold: float) -> DrawnFrame:
+def draw_frame(renderer: Renderer, script: TrackScript, i: int, poses: Poses, visible_threshold: float) -> DrawnFrame:
     """Draw frame i from the given poses; annotate the target and the bystanders."""
     pose = world_from_camera(poses.positions_m[i], poses.rotations_deg[i])
     target_m = poses.targets_m[i]
@@ -188,7 +191,7 @@ def draw_frame(renderer: Renderer, script: TrackScript, i: int, poses: Poses, th
         depth_m=view.depth_m,
         in_view=view.in_view,
         # A thin pole may hide the person and not the box: both depth and mask must show the target.
-        visible=view.in_view and score > threshold and num_px > 0,
+        visible=view.in_view and score > visible_threshold and num_px > 0,
         visibility=score,
         num_pixels=num_px,
     )
@@ -318,14 +321,14 @@ def _with_goal(track: Track, renderer: Renderer, script: TrackScript, cfg: Rende
 
 
 def _draw_dressed(
-    renderer: Renderer, script: TrackScript, i: int, threshold: float, looks: Appearance, number: int
+    renderer: Renderer, script: TrackScript, i: int, visible_threshold: float, looks: Appearance, number: int
 ) -> Frame:
     """Draw frame i with one person in another appearance."""
     if number == PERSON_ID:
         dressed = replace(script, clothes=replace(script.clothes, looks=looks))
     else:
         dressed = replace(script, bystanders=script.bystanders.dressed(number, looks))
-    return draw_frame(renderer, dressed, i, script.perturbed.poses, threshold).frame
+    return draw_frame(renderer, dressed, i, script.perturbed.poses, visible_threshold).frame
 
 
 def find_goal(people: People, i: int, draw: Callable[[Appearance, int], Frame], least_px: int) -> Goal | None:
@@ -333,39 +336,50 @@ def find_goal(people: People, i: int, draw: Callable[[Appearance, int], Frame], 
 
     Args:
         draw: Draws the frame with the person of an id in that appearance.
-        least_px: Fewest pixels by which a person shows a garment or the figure; a bystander of fewer pixels shows none,
-            and is taken as different from the target where the records differ.
+        least_px: Fewest pixels by which a person shows a garment or the figure. A bystander of fewer pixels is taken as
+            different from the target where the records differ.
     """
-    looks = people.target
-    everyone = {PERSON_ID: looks, **people.others}
-    frame = draw(looks, PERSON_ID)
+    compared = _Comparison(people, draw, least_px)
+    picture = SeenFrame(compared.frame.ids, compared.frame.depth)
+    says = find_says(compared.people, picture, partial(compared.differs_in_slot, PERSON_ID), compared.bystander_differs)
+    return None if says is None else Goal(i, **words_of(says, people.target), says=says)
 
-    @cache
-    def differs(other: Appearance, number: int) -> bool:
-        return people_differ(frame, draw(other, number), number, least_px)
 
-    def distinguishes(number: int, slot: str, other: Appearance) -> bool:
-        person = everyone[number]
+class _Comparison:
+    """What people look like in one frame, compared by drawing it again with one person in another appearance."""
+
+    def __init__(self, people: People, draw: Callable[[Appearance, int], Frame], least_px: int) -> None:
+        self.people = {PERSON_ID: people.target, **people.others}  # by instance id
+        self.frame = frame = draw(people.target, PERSON_ID)
+        self._least_px = least_px
+        # Whether a person looks different in another appearance, drawn once for each: the search asks again.
+        self._differs = cache(lambda number, looks: people_differ(frame, draw(looks, number), number, least_px))
+
+    def bystander_differs(self, slot: str, number: int) -> bool:
+        """Return whether a bystander looks unlike the target in a slot, or is so small that only records tell."""
+        is_small = np.count_nonzero(self.frame.ids == number) < self._least_px
+        return bool(is_small) or self.differs_in_slot(number, slot, self.people[PERSON_ID])
+
+    def differs_in_slot(self, number: int, slot: str, other: Appearance) -> bool:
+        """Return whether a person would look different if it wore what another appearance has in a slot."""
+        person = self.people[number]
         if slot == "figure":
-            return differs(replace(person, figure=other.figure), number)
-        color, other_color = (getattr(one, f"{slot}_color") for one in (person, other))
+            return self._differs(number, replace(person, figure=other.figure))
+        color_field = f"{slot}_color"
+        color, other_color = getattr(person, color_field), getattr(other, color_field)
         # The wardrobe's colours differ wherever they are visible. Whether this slot is visible is the same question for
-        # all other colours, so it is asked of one appearance, and `differs` draws it once.
+        # all other colours, so it is asked of one appearance, and `_differs` draws it once.
         if color and other_color and color != other_color:
             other = otherwise(person, slot)
-        return differs(replace(person, **{name: getattr(other, name) for name in (slot, f"{slot}_color")}), number)
-
-    def shows(slot: str, number: int) -> bool:
-        return bool((frame.ids == number).sum() < least_px) or distinguishes(number, slot, looks)
-
-    picture = SeenFrame(frame.ids, frame.depth)
-    says = find_says(everyone, picture, partial(distinguishes, PERSON_ID), shows)
-    return None if says is None else Goal(i, **words_of(says, looks), says=says)
+        changes = {field: getattr(other, field) for field in (slot, color_field)}
+        return self._differs(number, replace(person, **changes))
 
 
 def people_differ(frame: Frame, other: Frame, number: int, least_px: int) -> bool:
     """Return whether a person looks different to the eye in two frames that differ in its appearance only."""
     is_person = (frame.ids == number) | (other.ids == number)
-    a, b = (cv2.cvtColor(f.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[is_person] for f in (frame, other))
-    num_px = np.count_nonzero(np.linalg.norm(a - b, axis=-1) >= DIFFERENT_CONTRAST)
+    lab, other_lab = (
+        cv2.cvtColor(f.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[is_person] for f in (frame, other)
+    )
+    num_px = np.count_nonzero(np.linalg.norm(lab - other_lab, axis=-1) >= DIFFERENT_CONTRAST)
     return bool(num_px >= max(least_px, DIFFERENT_SHARE * np.count_nonzero(is_person)))
