@@ -18,18 +18,20 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.weather import WeatherParams
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Frame, Others, PosedPerson, check_pose, far_as_sky
 from cosfly.render.gl import meshes, movers, programs
-from cosfly.render.gl.parts import DRAW_ORDER, NUM_MATERIALS, PART, CameraView, materials_of
+from cosfly.render.gl.parts import DRAW_ORDER, NEVER_PX, NUM_MATERIALS, PART, CameraView, materials_of
 from cosfly.render.gl.programs import LooseBuffers, Programs, set_uniform
 from cosfly.render.gl.scene import build_scene
 from cosfly.render.gl.weather_pass import WeatherPass, defines
-from cosfly.render.person import figure_of
+from cosfly.render.person import PersonFigure, figure_of
 from cosfly.runtime.worker import return_freed_memory
 
 SHADOW_SIZE_PX = 2560  # side of the sun's shadow map
 HEIGHT_SIZE_PX = 768  # side of the height map
 AMBIENT_BLUR_M = 5.0
 TALLEST_AMBIENT_M = 14.0  # a tower hides no more sky from the street than a house of this height
-LARGEST_SHADOW_AREA_M = 420.0  # side
+SMALLEST_SHADOW_AREA_M, LARGEST_SHADOW_AREA_M = 40.0, 420.0  # side
+SHADOW_MARGIN = 1.1  # the shadow map is this many times as wide, so that its edge is outside the area
+ABOVE_CASTERS_M, BELOW_GROUND_M = 1.0, 10.0  # depth range of the height map
 MAX_BONES = 6
 EDGE_LEVELS = 5  # larger steps of brightness are smoothed
 EDGE_BLUR_PX = 0.62
@@ -105,7 +107,7 @@ class GlRenderer:
             self._height.filter = (context.NEAREST, context.NEAREST)  # it is smooth already, and this is faster
             for texture in (self._shadow, self._height):
                 texture.repeat_x = texture.repeat_y = False
-        self._area: dict[str, Any] = {}  # uniforms of what `prepare` computed
+        self._area: dict[str, Any] = {}  # uniforms of the shadow map and the height map, made by `prepare`
 
     def _use_weather(self, define: str | None) -> None:
         """Switch to the programs of fair weather (None), or of a weather with these defines."""
@@ -134,41 +136,47 @@ class GlRenderer:
     # --- one trajectory ---
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
-        """Compute sun shadows and sky openness for an area of the world, (3,) corners, and set the weather.
-
-        Each frame tests all selected parts, and kilometres from the origin float32 resolves only a millimetre. So the
-        parts that a camera within the corners can see are selected, and the origin is moved near them.
-        """
+        """Compute sun shadows and sky openness for an area of the world, (3,) corners, and set the weather."""
         low_m, high_m = np.asarray(low_m), np.asarray(high_m)
-        parts = self.scene.parts
-        zero = self.scene.origin_m
-        outside = np.maximum(low_m - zero - parts.object_centers, parts.object_centers - (high_m - zero))
-        away_m = np.linalg.norm(np.maximum(outside, 0.0), axis=1) - parts.object_radii
-        shift_m = np.round(((low_m + high_m) / 2.0 - zero) / ORIGIN_STEP_M) * [1.0, 1.0, 0.0] * ORIGIN_STEP_M
-        self.origin_m = zero + shift_m
-        self._parts = parts = parts.select(away_m < FAR_M).relative_to(shift_m)
-        self._groups = _groups(parts.records, parts.mesh)
+        self._select_parts(low_m, high_m)
         low, high = low_m - self.origin_m, high_m - self.origin_m
         middle = (low + high) / 2.0
-        half = float(np.clip((high - low)[:2].max() / 2.0, 20.0, LARGEST_SHADOW_AREA_M / 2.0))
+        half_m = float(np.clip((high - low)[:2].max(), SMALLEST_SHADOW_AREA_M, LARGEST_SHADOW_AREA_M)) / 2.0
+        shift_m = self.origin_m - self.scene.origin_m
 
-        def are_near(centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
-            return (np.abs(centers[:, :2] - middle[:2]) < half * 2.0 + radii[:, None]).all(axis=1)
+        def are_near(centers: np.ndarray, radii_m: np.ndarray) -> np.ndarray:
+            return (np.abs(centers[:, :2] - middle[:2]) < half_m * 2.0 + radii_m[:, None]).all(axis=1)
 
-        casting = np.flatnonzero(are_near(parts.object_centers, parts.object_radii) & (parts.max_px > 1e8))
+        parts = self._parts
+        is_detailed = parts.max_px >= NEVER_PX  # the simple forms of objects cast no shadows
+        casting = np.flatnonzero(are_near(parts.object_centers, parts.object_radii) & is_detailed)
         with self.context:
             self._use_weather(None if weather is None else defines(weather))
-            self._loose.place(self.origin_m - zero)
+            self._loose.place(shift_m)
             if self._weather is not None and weather is not None:
-                self._weather.prepare(weather, parts, self.scene.lamps - (self.origin_m - zero), middle, half)
+                self._weather.prepare(weather, parts, self.scene.lamps - shift_m, middle, half_m)
             self._sun = self.look.sun_direction() if self._weather is None else self._weather.sun_direction
             near = are_near(self._loose.centers, self._loose.radii)
             centers = np.concatenate([parts.object_centers[casting], self._loose.centers[near]])
-            radii = np.concatenate([parts.object_radii[casting], self._loose.radii[near]])
+            radii_m = np.concatenate([parts.object_radii[casting], self._loose.radii[near]])
             self._loose.see(None)
-            self._prepare_shadow(casting, centers, radii, middle, half)
-            top = float((centers[:, 2] + radii).max(initial=self._ground_z)) + 1.0
-            self._prepare_openness(casting, top, middle, half)
+            self._prepare_shadow(casting, centers, radii_m, middle, half_m)
+            top = float((centers[:, 2] + radii_m).max(initial=self._ground_z)) + ABOVE_CASTERS_M
+            self._prepare_openness(casting, top, middle, half_m)
+
+    def _select_parts(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
+        """Select the parts that a camera within the corners can see, and move the origin near them.
+
+        Each frame tests all selected parts, and kilometres from the origin float32 resolves only a millimetre.
+        """
+        parts = self.scene.parts
+        zero_m = self.scene.origin_m
+        outside_m = np.maximum(low_m - zero_m - parts.object_centers, parts.object_centers - (high_m - zero_m))
+        away_m = np.linalg.norm(np.maximum(outside_m, 0.0), axis=1) - parts.object_radii
+        shift_m = np.round(((low_m + high_m) / 2.0 - zero_m) / ORIGIN_STEP_M) * [1.0, 1.0, 0.0] * ORIGIN_STEP_M
+        self.origin_m = zero_m + shift_m  # (3,) world; positions that do not end in _m are relative to it, in m
+        self._parts = parts.select(away_m < FAR_M).relative_to(shift_m)
+        self._part_groups = _groups(self._parts.records, self._parts.mesh)
 
     @property
     def _ground_z(self) -> np.float64:
@@ -176,30 +184,31 @@ class GlRenderer:
         return self.scene.plane_z_m - self.origin_m[2]
 
     def _prepare_shadow(
-        self, casting: np.ndarray, centers: np.ndarray, radii: np.ndarray, middle: np.ndarray, half: float
+        self, casting: np.ndarray, centers: np.ndarray, radii_m: np.ndarray, middle: np.ndarray, half_m: float
     ) -> None:
-        """Draw the shadow map of the sun; centers, radii: of the casters near the middle."""
+        """Draw the shadow map of the sun; centers, radii_m: of the casters near the middle."""
         sun = self._sun
         side = np.cross([0.0, 0.0, 1.0], sun)
         side /= np.linalg.norm(side)
         axes = np.stack([side, np.cross(sun, side), -sun])  # rows: right, up, away from the sun
-        depth_half = float((np.abs((centers - middle) @ sun) + radii).max(initial=half))  # towers cast from afar
+        depth_half_m = float((np.abs((centers - middle) @ sun) + radii_m).max(initial=half_m))  # towers cast from afar
+        width_half_m = half_m * SHADOW_MARGIN
         clip_from_world = np.eye(4)
-        clip_from_world[:3, :3] = axes / np.array([[half * 1.1], [half * 1.1], [depth_half]])
+        clip_from_world[:3, :3] = axes / np.array([[width_half_m], [width_half_m], [depth_half_m]])
         clip_from_world[:3, 3] = -clip_from_world[:3, :3] @ middle
         self._draw_depth(self._shadow_target, clip_from_world, casting)
         to_texture = np.diag([0.5, 0.5, 0.5, 1.0])
         to_texture[:3, 3] = 0.5
         self._area["shadow_from_world"] = to_texture @ clip_from_world
-        self._area["shadow_texel_m"] = 2.2 * half / SHADOW_SIZE_PX
+        self._area["shadow_texel_m"] = 2.0 * width_half_m / SHADOW_SIZE_PX
 
-    def _prepare_openness(self, casting: np.ndarray, top: float, middle: np.ndarray, half: float) -> None:
+    def _prepare_openness(self, casting: np.ndarray, top: float, middle: np.ndarray, half_m: float) -> None:
         """Draw a blurred height map from above: higher objects nearby darken a point. top: no caster is higher."""
-        depth_m = top - self._ground_z + 10.0
-        low = middle[:2] - half
-        pixel_m = 2.0 * half / HEIGHT_SIZE_PX
-        clip_from_world = np.diag([1.0 / half, 1.0 / half, -2.0 / depth_m, 1.0])
-        clip_from_world[:3, 3] = -middle[0] / half, -middle[1] / half, 2.0 * top / depth_m - 1.0
+        depth_m = top - self._ground_z + BELOW_GROUND_M
+        low = middle[:2] - half_m
+        pixel_m = 2.0 * half_m / HEIGHT_SIZE_PX
+        clip_from_world = np.diag([1.0 / half_m, 1.0 / half_m, -2.0 / depth_m, 1.0])
+        clip_from_world[:3, 3] = -middle[0] / half_m, -middle[1] / half_m, 2.0 * top / depth_m - 1.0
         texture = self.context.depth_texture((HEIGHT_SIZE_PX, HEIGHT_SIZE_PX))
         target = self.context.framebuffer(depth_attachment=texture)
         self._draw_depth(target, clip_from_world, casting)
@@ -210,7 +219,7 @@ class GlRenderer:
         heights = np.minimum(heights, self._ground_z + TALLEST_AMBIENT_M).astype(np.float32)
         heights = cv2.GaussianBlur(heights, (0, 0), max(AMBIENT_BLUR_M / pixel_m, 0.5))
         self._height.write(np.ascontiguousarray(heights).tobytes())
-        self._area["height_area"] = np.array([*low, 0.5 / half, 0.5 / half])
+        self._area["height_area"] = np.array([*low, 0.5 / half_m, 0.5 / half_m])
 
     def _draw_depth(self, target: Any, clip_from_world: np.ndarray, rows: np.ndarray) -> None:
         target.use()
@@ -233,11 +242,7 @@ class GlRenderer:
         view = CameraView(camera_pose[:3, :3], eye, intrinsic, self.width_px, self.height_px)
         moving = [] if figure is None else [movers.figure_parts(figure, PERSON_ID, self.origin_m)]
         moving += movers.bystander_parts(others, self.origin_m, view)
-        bones = np.zeros((0, 2, 4), np.float32)
-        if figure is not None:
-            bones = np.zeros((len(figure.bones_m), 2, 4), np.float32)
-            bones[..., :3] = figure.bones_m - self.origin_m
-            bones[:, 0, 3] = figure.bone_radii_m
+        bones = np.zeros((0, 2, 4), np.float32) if figure is None else _bones_of(figure, self.origin_m)
         capsules = movers.capsules_of(others, self.origin_m, view)
         has_headlights = self._weather is not None and self._weather.has_lights
         regions = movers.shadow_regions(bones, capsules, self._sun, view, has_headlights)
@@ -299,11 +304,7 @@ class GlRenderer:
                 set_uniform(program, name, packed)
 
     def _draw_region(
-        self,
-        region: movers.ShadowRegion,
-        bones: np.ndarray,
-        rows: np.ndarray,
-        moving: list[tuple[np.ndarray, np.ndarray]],
+        self, region: movers.ShadowRegion, bones: np.ndarray, rows: np.ndarray, moving: list[movers.Mover]
     ) -> None:
         """Draw the rectangle of a shadow region again, with the shadows of its movers."""
         for name, count, most, capsules in (
@@ -319,16 +320,16 @@ class GlRenderer:
         center = (region.points.min(axis=0) + region.points.max(axis=0)) / 2.0
         radius = float(np.linalg.norm(region.points - center, axis=1).max())
         away = np.linalg.norm(self._parts.object_centers[rows] - center, axis=1) - self._parts.object_radii[rows]
-        near = [part for part in moving if np.linalg.norm(part[0]["center"][0] - center) < radius + MOVER_M]
+        near = [mover for mover in moving if np.linalg.norm(mover.records["center"][0] - center) < radius + MOVER_M]
         x0, y0, x1, y1 = region.rectangle_px
         self._image.scissor = x0, y0, x1 - x0, y1 - y0
         self._draw_scene(self._programs.near_movers, rows[away < radius], near)
         self._image.scissor = None
 
-    def _draw_scene(self, materials: list[Any], rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]) -> None:
-        """Draw parts by material in DRAW_ORDER. moving: records and meshes of the movers."""
-        records = np.concatenate([*(part for part, _ in moving), self._parts.records[rows]])
-        groups = np.concatenate([*(_groups(part, mesh) for part, mesh in moving), self._groups[rows]])
+    def _draw_scene(self, materials: list[Any], rows: np.ndarray, moving: list[movers.Mover]) -> None:
+        """Draw the movers and these rows of the parts by material, in DRAW_ORDER."""
+        records = np.concatenate([*(mover.records for mover in moving), self._parts.records[rows]])
+        groups = np.concatenate([*(_groups(*mover) for mover in moving), self._part_groups[rows]])
         order = np.argsort(groups, kind="stable")
         records = records[order]
         starts = np.searchsorted(groups[order], np.arange(NUM_MATERIALS * MESH_STRIDE + 1))
@@ -382,6 +383,14 @@ def smoothed(rgb: np.ndarray) -> np.ndarray:
     return cv2.copyTo(cv2.GaussianBlur(rgb, (3, 3), EDGE_BLUR_PX), mask, rgb)
 
 
-def _groups(records: np.ndarray, mesh: np.ndarray) -> np.ndarray:
+def _groups(records: np.ndarray, mesh_numbers: np.ndarray) -> np.ndarray:
     """Return a number for each combination of material and mesh, (k,)."""
-    return materials_of(records).astype(np.int64) * MESH_STRIDE + mesh
+    return materials_of(records).astype(np.int64) * MESH_STRIDE + mesh_numbers
+
+
+def _bones_of(figure: PersonFigure, origin_m: np.ndarray) -> np.ndarray:
+    """Return the bones of a person as capsules, (b, 2, 4) float32: [start, radius] and [end, 0]."""
+    bones = np.zeros((len(figure.bones_m), 2, 4), np.float32)
+    bones[..., :3] = figure.bones_m - origin_m
+    bones[:, 0, 3] = figure.bone_radii_m
+    return bones

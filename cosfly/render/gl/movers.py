@@ -24,8 +24,15 @@ PERSON_RADIUS_M = 1.0  # radius of a sphere that holds a person
 PERSON_CAPSULE_M = (0.15, 1.62, 0.19)  # lower and upper end above the feet, radius
 
 
-def figure_parts(figure: PersonFigure, instance_id: int, origin_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the records (k,) PART and meshes (k,) of a figure, relative to the origin."""
+class Mover(NamedTuple):
+    """A person or a car as k parts, relative to the origin."""
+
+    records: np.ndarray  # (k,) PART
+    mesh_numbers: np.ndarray  # (k,)
+
+
+def figure_parts(figure: PersonFigure, instance_id: int, origin_m: np.ndarray) -> Mover:
+    """Return the parts of a figure."""
     records = np.zeros(len(figure.shapes), PART)
     records["center"] = figure.centers_m - origin_m
     records["half"] = figure.half_m
@@ -33,11 +40,11 @@ def figure_parts(figure: PersonFigure, instance_id: int, origin_m: np.ndarray) -
     records["quaternion"] = Rotation.from_matrix(figure.turns).as_quat()
     records["tag"] = tags(KINDS["Pedestrians"], CLOTH, np.full(len(records), instance_id))
     records["bias"] = LAYER_STEP * STANDING_LAYER
-    return records, np.array([SHAPES[shape] for shape in figure.shapes])
+    return Mover(records, np.array([SHAPES[shape] for shape in figure.shapes]))
 
 
-def bystander_parts(others: Others, origin_m: np.ndarray, view: CameraView) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return records and meshes of the bystanders that the camera may see."""
+def bystander_parts(others: Others, origin_m: np.ndarray, view: CameraView) -> list[Mover]:
+    """Return the parts of the bystanders that the camera may see."""
     parts = []
     for other in others:
         center = other.center_m - origin_m
@@ -49,15 +56,15 @@ def bystander_parts(others: Others, origin_m: np.ndarray, view: CameraView) -> l
     return parts
 
 
-def _car_parts(car: PosedCar, instance_id: int, center: np.ndarray, view: CameraView) -> tuple[np.ndarray, np.ndarray]:
-    """Return records and meshes of a car, in the shape of a map's parked cars."""
+def _car_parts(car: PosedCar, instance_id: int, center: np.ndarray, view: CameraView) -> Mover:
+    """Return the parts of a car, in the shape of a map's parked cars."""
     turn = rotation_matrix(0.0, car.heading_rad, 0.0)
     half = np.array(car.half_extents_m)
     ids = np.array([instance_id], np.uint16)
     boxes = Boxes(center[None], half[None], turn[None], ids, np.array([car.seed]), KINDS["Car"], np.zeros(1))
     parts = Parts.concatenate(parts_of(boxes))
     rows = view.part_rows_in_view(parts)
-    return parts.records[rows], parts.mesh[rows]
+    return Mover(parts.records[rows], parts.mesh[rows])
 
 
 def capsules_of(others: Others, origin_m: np.ndarray, view: CameraView) -> np.ndarray:
