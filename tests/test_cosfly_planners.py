@@ -118,9 +118,8 @@ def test_the_loss_never_rises_and_the_flight_is_safe(world):
     problem = muco.make_problem(scenario, CFG)
     first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
     assert_safe(first, obstacles)
-    points, solver = muco.optimize(first, problem, obstacles, CFG.muco)
+    points, solver, history = muco.optimize(first, problem, obstacles, CFG.muco)
     assert_safe(points, obstacles)
-    history = np.array(solver["loss_history"])
     assert (np.diff(history) < 0).all()
     assert solver["stopped"] in ("converged", "no_step")
     assert history[-1] == pytest.approx(sum(plain_terms(points, problem, obstacles).values()))
@@ -170,9 +169,9 @@ def test_the_papers_optimizer_is_the_one_that_is_printed(world, monkeypatch):
     first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
     monkeypatch.setattr(MucoConfig, "iterations_max", 5)
     cfg = MucoConfig(step="paper")
-    points, plain = muco.optimize(first, problem, obstacles, cfg)
+    points, plain, history = muco.optimize(first, problem, obstacles, cfg)
     expected, _ = papers_losses(first, problem, obstacles, cfg, 5)
-    np.testing.assert_allclose(plain["loss_history"], expected, rtol=1e-6)
+    np.testing.assert_allclose(history, expected, rtol=1e-6)
     assert (np.diff(expected) > 0).any()
     assert (plain["stopped"], plain["iterations"]) == ("iteration_limit", 5)
     assert_safe(points, obstacles)
@@ -183,7 +182,7 @@ def test_the_end_is_within_five_percent_of_a_general_solver(world):
     scenario, obstacles = scenario_of(world)
     problem = muco.make_problem(scenario, CFG)
     first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
-    _, solver = muco.optimize(first, problem, obstacles, CFG.muco)
+    _, solver, _ = muco.optimize(first, problem, obstacles, CFG.muco)
     state, unmasked = loss.make_state(len(first), len(obstacles.rows)), np.zeros(len(first), dtype=bool)
 
     def loss_and_gradient(interior):
@@ -509,12 +508,12 @@ def test_a_flight_does_not_depend_on_the_memory(monkeypatch):
     scenario = Scenario("w", targets, np.zeros(len(targets)), follow(targets, cfg))
     problem = muco.make_problem(scenario, cfg)
     first, _ = muco.start_trajectory(scenario, problem, obstacles, cfg)
-    points, solver = muco.optimize(first, problem, obstacles, cfg.muco)
+    points, solver, history = muco.optimize(first, problem, obstacles, cfg.muco)
     monkeypatch.setattr(step, "remember_boxes", lambda *_: None)
     monkeypatch.setattr(muco, "descend", step.descend.py_func)  # the loop in Python, so that it calls what is set above
-    without, solver_without = muco.optimize(first, problem, obstacles, cfg.muco)
+    without, solver_without, history_without = muco.optimize(first, problem, obstacles, cfg.muco)
     np.testing.assert_array_equal(points, without)
-    np.testing.assert_array_equal(solver.pop("loss_history"), solver_without.pop("loss_history"))
+    np.testing.assert_array_equal(history, history_without)
     assert solver == solver_without
     assert solver["iterations"] > 5
     assert solver["terms"]["visibility"] > 0

@@ -96,7 +96,7 @@ def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
     z = np.maximum(heights_m[frames, None] + STEP_UP_M * rings[:, 1], least_z[:, None])
     z = np.minimum(z, np.maximum(greatest_z, least_z)[:, None])
     turns_rad = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
-    places_m = _places(scenario, frames, radii_m, z, turns_rad)
+    places_m = places_on_rings(scenario, frames, radii_m, z, turns_rad)
     distance_errors = (radii_m - ground_distances_m) / distances_m
     height_errors = STEP_UP_M * rings[:, 1] / distances_m
     costs = _costs(distance_errors, height_errors, turns_rad, any_bearing=scenario.reference.any_bearing)
@@ -107,7 +107,7 @@ def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
     return Lattice(frames, places_m, costs, _links(rings), float(radii_m.max()), max_turn)
 
 
-def _places(
+def places_on_rings(
     scenario: Scenario, frames: np.ndarray, radii_m: np.ndarray, z: np.ndarray, turns_rad: np.ndarray
 ) -> np.ndarray:
     """Return the places on the rings, (m, r, a, 3) m; radii_m, z: (m, r). turns_rad: (a,) from the reference."""

@@ -121,7 +121,9 @@ def compare_with_scipy(scene: Scene, cfg: PlanConfig) -> list:
     for scenario in scene.scenarios:
         problem = muco.make_problem(scenario, cfg)
         first, _ = muco.start_trajectory(scenario, problem, scene.obstacles, cfg)
-        ms, (_, solver) = scenes.cpu_ms(lambda f=first, p=problem: muco.optimize(f, p, scene.obstacles, without_rule))
+        ms, (_, solver, _) = scenes.cpu_ms(
+            lambda f=first, p=problem: muco.optimize(f, p, scene.obstacles, without_rule)
+        )
         state, unmasked = make_state(len(first), len(scene.obstacles.rows)), np.zeros(len(first), dtype=bool)
 
         def loss_and_gradient(interior, first=first, problem=problem, state=state, unmasked=unmasked):

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from cosfly.geometry.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays, nearest_box, visibility
 from cosfly.planners.contract import MucoConfig, Plan, PlanConfig, Scenario
-from cosfly.planners.foresight import cheapest_way
+from cosfly.planners.foresight import SPEED_SHARE, cheapest_way, places_on_rings
 from cosfly.planners.muco.loss import TERM_NAMES, Problem, make_state
 from cosfly.planners.muco.nearby import nothing_nearby
 from cosfly.planners.muco.step import STOP_REASONS, Rules, descend, descend_paper, is_feasible, project
@@ -29,7 +29,8 @@ from cosfly.runtime.compiled import njit
 # Places around the target: NUM_AZIMUTHS on each ring. The first ring is the normal one, the second is steeper (into
 # canyons). The others climb over obstacles and are tried only if the first two do not suffice.
 STEEP_RADIUS, STEEP_CLIMB_M = 0.6, 6.0
-NUM_CLIMBS = 5
+NUM_CLIMBS, LEAST_CLIMB_M = 5, 8.0
+WIDEN = 0.2  # metres that a ring is farther from the target per metre of climb
 NUM_AZIMUTHS = 18
 MAX_TURN = 3  # azimuths between one key frame and the next: 60 degrees, 21 m on the normal ring in 3 s
 BETWEEN_KEYS_S = 3.0
@@ -37,7 +38,7 @@ BETWEEN_KEYS_S = 3.0
 # Costs of the search, in units of "the target fully hidden for one key frame" = 1.
 TURN_COST = 0.5  # of the bearing opposite to the reference
 TURN_COST_OF_STYLES = 8.0  # where the bearing is the purpose: 64 degrees cost as much as a hidden target
-CLIMB_COST = 0.6  # per 20 m above the preferred altitude
+CLIMB_COST, CLIMB_SCALE_M = 0.6, 20.0  # climb / scale, above the preferred altitude
 STEEP_COST = 0.1  # a ring other than the normal one
 MOVE_COST, MOVE_SCALE_MPS = 0.25, 3.0  # (speed / scale)^2
 
@@ -52,24 +53,20 @@ def search_start(
     Returns:
         (n, 3), straight between key frames, all of it `clearance_m` from all boxes; None if there is none.
     """
-    targets_m = problem.targets
     reference = scenario.reference
     keys, _, preferred_m, greatest_m = scenario.key_frames(max(1, round(BETWEEN_KEYS_S / problem.dt_s)))
-    rings = _rings(reference.ground_distance_m[keys], preferred_m, greatest_m, climbing)
-    azimuths = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
-    angles = problem.views_rad[keys, None, None] + np.pi + azimuths[None, None, :]
-    offsets = rings[:, :, 0, None]
-    middles = targets_m[keys, :2, None, None]
-    x, y = middles[:, 0] + offsets * np.cos(angles), middles[:, 1] + offsets * np.sin(angles)
-    places = np.stack([x, y, np.broadcast_to(rings[:, :, 1, None], x.shape)], axis=-1).reshape(len(keys), -1, 3)
-    turns = np.minimum(azimuths, 2.0 * np.pi - azimuths) / np.pi
-    climbs = np.maximum(rings[0, :, 1] - preferred_m[0], 0.0)[:, None] / 20.0
+    rings = _rings(reference.ground_distance_m[keys], preferred_m, greatest_m, climbing)  # (m, rings, 2)
+    azimuths_rad = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
+    places_m = places_on_rings(scenario, keys, rings[:, :, 0], rings[:, :, 1], azimuths_rad).reshape(len(keys), -1, 3)
+    # Costs, (rings, azimuths): the rings climb by almost the same at all key frames, so the first stands for all.
+    turns = np.minimum(azimuths_rad, 2.0 * np.pi - azimuths_rad) / np.pi
+    climbs = np.maximum(rings[0, :, 1] - preferred_m[0], 0.0)[:, None] / CLIMB_SCALE_M
     turn_cost = TURN_COST if reference.any_bearing else TURN_COST_OF_STYLES
-    extra = turn_cost * turns[None] ** 2 + CLIMB_COST * climbs + STEEP_COST * (np.arange(rings.shape[1]) > 0)[:, None]
-    times_s = keys * problem.dt_s
-    keeps_sight = reference.keeps_sight[keys]
-    chosen = _search(places, targets_m[keys], times_s, extra, keeps_sight, index, clearance_m, cfg.speed_max_mps)
-    return None if chosen[0] < 0 else scenario.between(keys, places[np.arange(len(keys)), chosen])
+    costs = turn_cost * turns[None] ** 2 + CLIMB_COST * climbs + STEEP_COST * (np.arange(rings.shape[1]) > 0)[:, None]
+    targets_m, times_s, keeps_sight = problem.targets[keys], keys * problem.dt_s, reference.keeps_sight[keys]
+    limit_mps = SPEED_SHARE * cfg.speed_max_mps
+    chosen = _search(places_m, targets_m, times_s, costs, keeps_sight, index, clearance_m, limit_mps)
+    return None if chosen[0] < 0 else scenario.between(keys, places_m[np.arange(len(keys)), chosen])
 
 
 def _rings(distances_m: np.ndarray, preferred_m: np.ndarray, greatest_m: np.ndarray, climbing: bool) -> np.ndarray:
@@ -77,65 +74,81 @@ def _rings(distances_m: np.ndarray, preferred_m: np.ndarray, greatest_m: np.ndar
     all_rings = []
     for distance_m, preferred, greatest in np.stack([distances_m, preferred_m, greatest_m], axis=1).tolist():
         rings = [(distance_m, preferred), (STEEP_RADIUS * distance_m, min(preferred + STEEP_CLIMB_M, greatest))]
-        climbs = np.geomspace(8.0, max(greatest - preferred, 8.0), NUM_CLIMBS if climbing else 0)
-        all_rings.append(rings + [(distance_m + 0.2 * climb, min(preferred + climb, greatest)) for climb in climbs])
+        climbs = np.geomspace(LEAST_CLIMB_M, max(greatest - preferred, LEAST_CLIMB_M), NUM_CLIMBS if climbing else 0)
+        all_rings.append(rings + [(distance_m + WIDEN * climb, min(preferred + climb, greatest)) for climb in climbs])
     return np.array(all_rings)
 
 
 @njit(cache=True)
-def _search(places, targets, times_s, extra, keeps_sight, index, clearance_m, speed_max_mps):
+def _search(places, targets, times_s, costs, keeps_sight, index, clearance_m, limit_mps):
     """Return the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
 
-    places: (m, c, 3), c = rings * azimuths. targets: (m, 3). times_s: (m,). extra: (rings, azimuths) cost of a place
-    apart from visibility. keeps_sight: (m,) bool, whether visibility counts.
+    places: (m, c, 3), c = rings * azimuths.
+    targets: (m, 3).
+    times_s: (m,).
+    costs: (rings, azimuths) of a place apart from visibility.
+    keeps_sight: (m,) bool, whether visibility counts.
     """
-    num_keys, num_places, num_azimuths = len(places), places.shape[1], extra.shape[1]
-    blockers = np.empty(len(index.rows), dtype=np.int64)
-    first_hit = np.empty(1, dtype=np.int64)
-    cost = np.full((num_keys, num_places), np.inf)
+    num_keys, num_places = len(places), places.shape[1]
+    way_costs = np.full((num_keys, num_places), np.inf)
     came_from = np.full((num_keys, num_places), -1, dtype=np.int64)
-    place_cost, guesses = np.empty(num_places), np.empty(num_places)
+    blockers, guesses = np.empty(len(index.rows), dtype=np.int64), np.empty(num_places)
     for key in range(num_keys):
-        for c in range(num_places):
-            p = places[key, c]
-            hip = targets[key]
-            gap, _ = nearest_box(index, p[0], p[1], p[2], clearance_m)
-            place_cost[c] = np.inf
-            if gap >= clearance_m:
-                visible_share = 1.0
-                if keeps_sight[key]:
-                    count = collect_hits(index, hip[0], hip[1], hip[2], p[0], p[1], p[2], RAY_SPREAD_M, blockers)
-                    visible_share = free_rays(index, blockers, count, p[0], p[1], p[2], hip)
-                place_cost[c] = extra[c // num_azimuths, c % num_azimuths] + 1.0 - visible_share
+        place_costs = _place_costs(places[key], targets[key], costs, keeps_sight[key], index, clearance_m, blockers)
         if key == 0:
-            for c in range(num_places):
-                cost[0, c] = place_cost[c]
+            way_costs[0] = place_costs
             continue
         step_s = times_s[key] - times_s[key - 1]
         for c in range(num_places):
-            if place_cost[c] == np.inf:
-                continue
-            p = places[key, c]
-            for before in range(num_places):
-                turn = abs(c % num_azimuths - before % num_azimuths)
-                guesses[before] = np.inf
-                if cost[key - 1, before] == np.inf or min(turn, num_azimuths - turn) > MAX_TURN:
-                    continue
-                q = places[key - 1, before]
-                speed_mps = np.sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2) / step_s
-                if speed_mps <= 0.9 * speed_max_mps:
-                    guesses[before] = cost[key - 1, before] + MOVE_COST * (speed_mps / MOVE_SCALE_MPS) ** 2
-            while True:  # the cheapest predecessor whose segment is free; most often the first
-                before = int(np.argmin(guesses))
-                if guesses[before] == np.inf:
-                    break
-                q = places[key - 1, before]
-                if collect_hits(index, q[0], q[1], q[2], p[0], p[1], p[2], clearance_m, first_hit) == 0:
-                    cost[key, c] = guesses[before] + place_cost[c]
-                    came_from[key, c] = before
-                    break
-                guesses[before] = np.inf
-    return cheapest_way(cost, came_from)
+            if place_costs[c] < np.inf:
+                came_from[key, c], way_cost = _cheapest_predecessor(
+                    places[key], c, places[key - 1], way_costs[key - 1], step_s, index, clearance_m, limit_mps, guesses
+                )
+                way_costs[key, c] = way_cost + place_costs[c]
+    return cheapest_way(way_costs, came_from)
+
+
+@njit(cache=True)
+def _place_costs(places, target, costs, keeps_sight, index, clearance_m, blockers):
+    """Return the costs of the places of one key frame with visibility, (c,), infinite where a box is too near."""
+    place_costs = np.full(len(places), np.inf)
+    for c in range(len(places)):
+        x, y, z = places[c, 0], places[c, 1], places[c, 2]
+        if nearest_box(index, x, y, z, clearance_m)[0] >= clearance_m:
+            visible_share = 1.0
+            if keeps_sight:
+                num_hits = collect_hits(index, target[0], target[1], target[2], x, y, z, RAY_SPREAD_M, blockers)
+                visible_share = free_rays(index, blockers, num_hits, x, y, z, target)
+            place_costs[c] = costs[c // NUM_AZIMUTHS, c % NUM_AZIMUTHS] + 1.0 - visible_share
+    return place_costs
+
+
+@njit(cache=True)
+def _cheapest_predecessor(places, c, previous, way_costs, step_s, index, clearance_m, limit_mps, guesses):
+    """Return the place of the previous key frame from which place c is reached at least cost, and the cost; or -1, inf.
+
+    places, previous: (c, 3) of this and of the previous key frame.
+    way_costs: (c,) of the cheapest way to each previous place.
+    guesses: (c,), written.
+    """
+    x, y, z = places[c, 0], places[c, 1], places[c, 2]
+    for before in range(len(previous)):
+        guesses[before] = np.inf
+        turn = abs(c % NUM_AZIMUTHS - before % NUM_AZIMUTHS)
+        if way_costs[before] < np.inf and min(turn, NUM_AZIMUTHS - turn) <= MAX_TURN:
+            x0, y0, z0 = previous[before, 0], previous[before, 1], previous[before, 2]
+            speed_mps = np.sqrt((x - x0) ** 2 + (y - y0) ** 2 + (z - z0) ** 2) / step_s
+            if speed_mps <= limit_mps:
+                guesses[before] = way_costs[before] + MOVE_COST * (speed_mps / MOVE_SCALE_MPS) ** 2
+    first_hit = np.empty(1, dtype=np.int64)
+    while True:  # until a segment is free; most often the first
+        before = int(np.argmin(guesses))
+        if guesses[before] == np.inf:
+            return -1, np.inf
+        x0, y0, z0 = previous[before, 0], previous[before, 1], previous[before, 2]
+        if collect_hits(index, x0, y0, z0, x, y, z, clearance_m, first_hit) == 0:
+            return before, guesses[before]
+        guesses[before] = np.inf
 
 
 # Reasons to stop that count as converged. If no step of any length lowers the loss, its change is 0.
@@ -146,8 +159,7 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
     """Plan one trajectory (the signature of `planners.contract`); nothing here is random."""
     problem = make_problem(scenario, cfg)
     start, kind = start_trajectory(scenario, problem, obstacles, cfg)
-    points, solver = optimize(start, problem, obstacles, cfg.muco)
-    del solver["loss_history"]  # for tests and plots; a product does not need it
+    points, solver, _ = optimize(start, problem, obstacles, cfg.muco)
     limits = cfg.model_copy(update={"accel_max_mps2": np.inf}) if cfg.muco.step == "paper" else cfg
     points = repair_to_limits(points, scenario, obstacles, limits)
     return Plan(points, {"start": kind, **solver}, is_converged=solver["stopped"] in CONVERGED_REASONS)
@@ -212,29 +224,31 @@ def _rounded_off(points: np.ndarray, problem: Problem, obstacles: BoxIndex) -> n
 # --- optimisation -----------------------------------------------------------------------------------------------------
 
 
-def optimize(start: np.ndarray, problem: Problem, obstacles: BoxIndex, cfg: MucoConfig) -> tuple[np.ndarray, dict]:
+def optimize(
+    start: np.ndarray, problem: Problem, obstacles: BoxIndex, cfg: MucoConfig
+) -> tuple[np.ndarray, dict, np.ndarray]:
     """Optimize a feasible trajectory; its ends do not move.
 
     Args:
         start: (n, 3), feasible.
     Returns:
-        (n, 3) and the solver's facts: numbers of iterations and evaluations, reason to stop, losses at start and end
-        and by term, number of masked waypoints, loss history.
+        (n, 3); the solver's facts for the product; the loss at the start and after each iteration.
     """
     points = np.array(start, dtype=np.float64)
     has_interior = len(points) > 2  # otherwise only the loss is computed
     history = np.zeros(cfg.iterations_max + 1 if has_interior else 1)
-    rules = Rules(*(getattr(cfg, name) for name in Rules._fields))
+    rules = Rules(*(getattr(cfg, name) for name in Rules._fields))  # compiled code takes no models
     state, spare = (make_state(len(points), len(obstacles.rows)) for _ in range(2))
-    spare = spare._replace(nearby=state.nearby)
+    spare = spare._replace(nearby=state.nearby)  # both evaluate trajectories near each other: one cache of boxes
     search = descend_paper if cfg.step == "paper" else descend
     points, state, masked, num_iterations, num_tried, reason = search(
         points, problem, obstacles, rules, (state, spare), history
     )
-    return points, {
+    facts = {
         "iterations": num_iterations, "evaluations": num_tried,
         "stopped": STOP_REASONS[reason] if has_interior else "no_interior_waypoint",
         "loss_start": round(float(history[0]), 6), "loss_end": round(float(state.terms.sum()), 6),
         "terms": {name: round(float(value), 6) for name, value in zip(TERM_NAMES, state.terms, strict=True)},
-        "num_masked": int(masked.sum()), "loss_history": history[: num_iterations + 1],
+        "num_masked": int(masked.sum()),
     }  # fmt: skip
+    return points, facts, history[: num_iterations + 1]
