@@ -36,7 +36,6 @@ from cosfly.runtime.seeding import draw_smooth
 HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # head from hip point: branches and signs may be in the way up there
 PERTURBED = "aug_001"  # the variant of the perturbed track
 STEP_UP_M = 0.5  # most by which a shifted person may be higher or lower than before; keeps people off roofs
-
 SEEN_LEAST = 0.3  # five-ray visibility of a target that a smooth shift must not hide
 
 # States of an event.
@@ -84,10 +83,8 @@ class Poses:
 
     def copy_frame(self, i: int, source: Poses) -> None:
         """Copy frame i from other poses, in place."""
-        self.positions_m[i] = source.positions_m[i]
-        self.rotations_deg[i] = source.rotations_deg[i]
-        self.targets_m[i] = source.targets_m[i]
-        self.clearances_m[i] = source.clearances_m[i]
+        for values, source_values in zip(vars(self).values(), vars(source).values(), strict=True):
+            values[i] = source_values[i]
 
 
 @dataclass(frozen=True)
@@ -180,11 +177,11 @@ def perturb(
     surroundings: Surroundings,
     cfg: PerturbationConfig,
     rng: np.random.Generator,
-    others: DressedBystanders = NO_BYSTANDERS,
+    bystanders: DressedBystanders = NO_BYSTANDERS,
     dt_s: float = DT_S,
 ) -> PerturbedTrack:
     """Perturb every frame of a trajectory. dt_s: between frames. The random draws do not depend on the map."""
-    scene = _Scene(planned, cameras, surroundings, cfg, others)
+    scene = _Scene(planned, cameras, surroundings, cfg, bystanders)
     if cfg.correlation_s == 0:
         return _apply(_draw_each_frame(len(cameras), cfg, rng), scene)
     return _apply_smoothly(_draw_smoothly(len(cameras), dt_s, cfg, rng), scene, dt_s)
@@ -225,13 +222,15 @@ def _offset(rng: np.random.Generator, cfg: PerturbationConfig, radius_m: float, 
 
 def _draw_smoothly(num: int, dt_s: float, cfg: PerturbationConfig, rng: np.random.Generator) -> _Draws:
     """Draw events and offsets that are smooth in time, with the distribution of `_draw_each_frame` in each frame."""
-    drawn = draw_smooth(num, 11, dt_s, cfg.correlation_s, rng)
-    events, person, drone, view, roll = np.split(drawn, [2, 4, 7, 10], axis=1)
+    # Standard normal columns: 2 events, 2 axes of the person's offset, 3 of the drone's, 3 of the view's, 1 roll.
+    normals = draw_smooth(num, 11, dt_s, cfg.correlation_s, rng)
+    events, person, drone, view, roll = np.split(normals, np.cumsum([2, 2, 3, 3]), axis=1)
 
     def offsets(normal: np.ndarray, radius_m: float) -> np.ndarray:
         num_axes = normal.shape[1]
         in_unit = 2.0 * ndtr(normal) - 1.0
         if cfg.sampling == "spherical":
+            # A squared length has a chi-square distribution; gammainc, its CDF, makes the volume within it uniform.
             squares = (normal**2).sum(axis=1, keepdims=True)
             in_unit = normal / np.sqrt(squares) * gammainc(num_axes / 2.0, squares / 2.0) ** (1.0 / num_axes)
         return np.hstack([radius_m * in_unit, np.zeros((num, 3 - num_axes))])
@@ -254,7 +253,7 @@ def _apply(drawn: _Draws, scene: _Scene) -> PerturbedTrack:
         if drawn.is_drawn["rotation"][i]:
             _turn(unshifted, i, drawn.view_m[i], drawn.roll[i], scene)
             _turn(track, i, drawn.view_m[i], drawn.roll[i], scene)
-        if position != APPLIED:
+        if position != APPLIED:  # also without an event: then the frame is that of the unshifted track
             track.drop_shift(i, position)
     return track
 
@@ -262,7 +261,7 @@ def _apply(drawn: _Draws, scene: _Scene) -> PerturbedTrack:
 def _apply_smoothly(drawn: _Draws, scene: _Scene, dt_s: float) -> PerturbedTrack:
     """Apply smooth events; around frames without an event and around fallbacks the offsets fade to zero.
 
-    A smaller offset may fall back too, so this is repeated until every remaining event passes the checks.
+    A smaller offset may fall back too, so rounds with ever fewer events are repeated until all events pass the checks.
     """
     obstacles = scene.surroundings.obstacles
     planned_degps = _yaw_rates_degps(scene.planned, dt_s)
@@ -272,21 +271,23 @@ def _apply_smoothly(drawn: _Draws, scene: _Scene, dt_s: float) -> PerturbedTrack
         active = {event: is_drawn.copy() for event, is_drawn in drawn.is_drawn.items()}
         for event, reasons in fallbacks.items():
             active[event][list(reasons)] = False
-        shift, turn = (_fade(active[event], scene.cfg.correlation_s / dt_s) for event in EVENTS)
-        person_m, drone_m, view_m = drawn.person_m * shift, drawn.drone_m * shift, drawn.view_m * turn
-        track = _apply(_Draws(active, person_m, drone_m, view_m, drawn.roll * turn[:, 0]), scene)
+        shift_fade, turn_fade = (_fade(active[event], scene.cfg.correlation_s / dt_s) for event in EVENTS)
+        person_m, drone_m, view_m = drawn.person_m * shift_fade, drawn.drone_m * shift_fade, drawn.view_m * turn_fade
+        track = _apply(_Draws(active, person_m, drone_m, view_m, drawn.roll * turn_fade[:, 0]), scene)
         hides = is_seen & (visibility(obstacles, track.poses.positions_m, track.poses.targets_m) < SEEN_LEAST)
         is_fast = _yaw_rates_degps(track.poses, dt_s) > np.maximum(planned_degps, YAW_RATE_MAX_DEGPS)
-        found = False
+        is_settled = True
         for event, reasons in fallbacks.items():
             for i in np.flatnonzero(active[event]).tolist():
                 state = track.states[i][event]
-                if state == APPLIED:
-                    state = TURNS_FAST if is_fast[i] else HIDDEN if event == "position" and hides[i] else APPLIED
+                if state == APPLIED and is_fast[i]:
+                    state = TURNS_FAST
+                elif state == APPLIED and event == "position" and hides[i]:
+                    state = HIDDEN
                 if state != APPLIED:
                     reasons[i] = state
-                    found = True
-        if not found:
+                    is_settled = False
+        if is_settled:
             break
     assert track.unshifted is not None
     for event, reasons in fallbacks.items():
@@ -309,7 +310,7 @@ def _fade(is_active: np.ndarray, fade_frames: float) -> np.ndarray:
 
 
 def _shift(track: PerturbedTrack, i: int, person_offset: np.ndarray, drone_offset: np.ndarray, scene: _Scene) -> str:
-    """Apply the position event of frame i if all checks pass. Return its state; offsets: (3,) m."""
+    """Apply the position event of frame i, in place, if all checks pass; return its state. Offsets: (3,) m."""
     planned = scene.planned
     target = planned.targets_m[i] + person_offset
     feet_z = planned.targets_m[i][2] - TARGET_HEIGHT_M
@@ -342,7 +343,7 @@ def _shift(track: PerturbedTrack, i: int, person_offset: np.ndarray, drone_offse
 
 
 def _turn(track: PerturbedTrack, i: int, view_offset: np.ndarray, roll: float, scene: _Scene) -> None:
-    """Turn the view of frame i from its present pose, or record the fallback.
+    """Turn the view of frame i from its present pose, or record the fallback, in place.
 
     Args:
         view_offset: (3,) m, from the person to the point to look at.
