@@ -153,11 +153,11 @@ def summarize(planned: dict[str, PlannedItem], planners: Sequence[str]) -> dict[
         its own, and the first planner's wins, where both found trajectories.
     """
     first, *others = planners
-    found = {path_id: item.read_traces(path_id) for path_id, item in planned.items()}
-    scenarios: list[dict[str, Any]] = [
-        {"id": path_id, **{name: trajectory_figures(traces[name]) if name in traces else None for name in planners}}
-        for path_id, traces in found.items()
-    ]
+    scenarios = list[dict[str, Any]]()
+    for path_id, item in planned.items():
+        traces = item.read_traces(path_id)
+        figures = {name: trajectory_figures(traces[name]) if name in traces else None for name in planners}
+        scenarios.append({"id": path_id, **figures})
     means = mean_figures({name: np.array([_table_row(row[name]) for row in scenarios]) for name in planners})
     pairs = {other: [(row[first], row[other]) for row in scenarios if row[first] and row[other]] for other in others}
     return {
@@ -294,16 +294,17 @@ def run(
         raise stage.nothing_kept(done.tally, expected="a pedestrian trajectory that at least one planner can follow")
     planned = {record.id: result_of(record, PlannedItem) for record in done.kept}
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.all_values()}
-    modules = {name: ALL_PLANNERS[name] for name in cfg.planners}
-    facts = {"planners": modules, "notes": planner_notes(cfg.planners, cfg)}
+    facts = {"planners": {name: ALL_PLANNERS[name] for name in cfg.planners}, "notes": planner_notes(cfg.planners, cfg)}
     write_json(product, {**FORMAT.header, **header, **facts, **summarize(planned, cfg.planners)})
-    found = [item.read_traces(path_id) for path_id, item in planned.items()]
-    traces = {name: [path_traces[name] for path_traces in found if name in path_traces] for name in cfg.planners}
-    outputs = [product, *(out / f"drone_trace_{name}.json" for name in traces), out / "compare_overlay.png"]
-    for path, (name, planner_traces) in zip(outputs[1:], traces.items(), strict=False):
-        write_traces(path, planner_traces, {**header, "planner": name})
+    planned_traces = [item.read_traces(path_id) for path_id, item in planned.items()]
+    traces = {name: [by_planner[name] for by_planner in planned_traces if name in by_planner] for name in cfg.planners}
+    trace_paths = {name: out / f"drone_trace_{name}.json" for name in traces}
+    for name, path in trace_paths.items():
+        write_traces(path, traces[name], {**header, "planner": name})
     compared = [pedestrian for pedestrian in pedestrians if pedestrian.path_id in planned]
-    write_bytes(outputs[-1], draw_compared(box_map, compared, traces))
+    overlay = out / "compare_overlay.png"
+    write_bytes(overlay, draw_compared(box_map, compared, traces))
+    outputs = [product, *trace_paths.values(), overlay]
     stage.finish(outputs, done.tally, timings=timings(planned.values(), cfg.planners))
     return product
 
@@ -331,8 +332,8 @@ def text_tables(product: Path) -> Iterator[TextTable]:
 
     columns, rows = ["found", "free of collisions", *_titles(SIGHT_AND_SAFETY)], {}
     for planner, figures in means.items():
-        found = [scenario[planner]["collision_fraction"] for scenario in scenarios if scenario[planner]]
-        counts = [f"{count} of {len(scenarios)}" for count in (len(found), found.count(0.0))]
+        collisions = [scenario[planner]["collision_fraction"] for scenario in scenarios if scenario[planner]]
+        counts = [f"{count} of {len(scenarios)}" for count in (len(collisions), collisions.count(0.0))]
         rows[title_of(planner)] = [*counts, *_figure_cells(figures, SIGHT_AND_SAFETY)]
     yield _table("Sight and safety; a missing trajectory counts as a collision without visibility", columns, rows)
 
@@ -345,7 +346,7 @@ def text_tables(product: Path) -> Iterator[TextTable]:
     )
     yield _table(title, [*_titles(FLIGHT), "planning, ms"], rows)
 
-    by_mean = sorted(comparison["axes"].items(), key=lambda entry: -entry[1]["mean"])
+    by_mean = sorted(comparison["axes"].items(), key=lambda planner_scores: -planner_scores[1]["mean"])
     rows = {title_of(planner): cells(scores[axis] for axis in AXES_AND_MEAN) for planner, scores in by_mean}
     title = f"Axis scores; efficiency relative to the shortest mean, {comparison['shortest_mean_m']:.2f} m"
     yield _table(title, [axis.replace("_", " ") for axis in AXES_AND_MEAN], rows)
@@ -365,7 +366,7 @@ def text_tables(product: Path) -> Iterator[TextTable]:
         group: [str(row["num_planners"]), *_figure_cells(row["figures"], shown)]
         for group, row in comparison["groups"].items()
     }
-    yield _table("Means of groups of planners", ["planners", *_titles(shown)], rows, of="group")
+    yield _table("Means of groups of planners", ["planners", *_titles(shown)], rows, head="group")
 
     shown = [column for column in FIGURES if column[0] in PAPER_DELTAS]
     rows = {
@@ -380,8 +381,8 @@ def text_tables(product: Path) -> Iterator[TextTable]:
     yield _table(f"{first} better than another planner", names, rows)
 
 
-def _table(title: str, columns: list[str], rows: dict[str, list[str]], of: str = "planner") -> TextTable:
-    return TextTable(title, [of, *columns], [[name, *row] for name, row in rows.items()])
+def _table(title: str, columns: list[str], rows: dict[str, list[str]], head: str = "planner") -> TextTable:
+    return TextTable(title, [head, *columns], [[name, *row] for name, row in rows.items()])
 
 
 def _titles(figures: Sequence[FigureColumn]) -> list[str]:
