@@ -22,6 +22,7 @@ from cosfly.llm.contract import Reply
 from cosfly.llm.protocol import (
     MEANINGS,
     MOST_CHARACTERS,
+    THOUGHT_FIELDS,
     BadReply,
     Refusal,
     Response,
@@ -68,37 +69,22 @@ def assistant(**message: object) -> bytes:
     return completion({"role": "assistant", **message}, finish_reason="stop")
 
 
-def called(arguments: object) -> dict:
-    return {"id": "call_1", "type": "function", "function": {"name": "chain_of_cause", "arguments": arguments}}
-
-
 # Who sends it, what; the text of its final message, or (word) what is said of it: then the request is sent again.
 BODIES: list[tuple[str, bytes, str | tuple[str]]] = [
     ("any server", assistant(content=TEXT), TEXT),
-    ("vLLM with a reasoning parser", assistant(content=TEXT, reasoning_content="Draft: {}", tool_calls=[]), TEXT),
-    ("vLLM 0.12 on, OpenRouter: field reasoning", assistant(content=TEXT, reasoning="I think", refusal=None), TEXT),
-    ("OpenRouter: reasoning_details", assistant(content=TEXT, reasoning_details=[{"text": TEXT}]), TEXT),
-    ("vLLM, Qwen3 and R1: the JSON in the reasoning", assistant(content=None, reasoning_content=TEXT), ""),
-    ("vLLM, Gemma 4: channel left open", assistant(content="", reasoning=f"thought {TEXT}"), ""),
-    ("Ollama: field thinking", assistant(content="", thinking="still at it"), ""),
-    ("vLLM, DeepSeek V4: thoughts up to max_tokens", completion({"content": None, "reasoning": "so"},
-        finish_reason="length"), ""),
-    ("gpt-oss on vLLM: neither content nor reasoning", assistant(content=None, reasoning=None), ("no text",)),
-    ("proxies: no content", assistant(), ("no text",)),
+    ("a reasoning parser", assistant(content=TEXT, tool_calls=[], **dict.fromkeys(THOUGHT_FIELDS, "Draft: {}")), TEXT),
+    *((f"the JSON in {name}", assistant(content=None, **{name: TEXT}), "") for name in THOUGHT_FIELDS),
     ("proxies: empty content", assistant(content=""), ""),
     ("proxies: a number", assistant(content=17), ("no text",)),
     ("OpenAI SDK servers: parts", assistant(content=[{"type": "text", "text": TEXT[:9]}, {"type": "text",
         "text": TEXT[9:]}]), TEXT),
-    ("Mistral, Magistral: thinking part", assistant(content=[{"type": "thinking", "thinking": [{"type": "text",
-        "text": "{}"}]}, {"type": "text", "text": TEXT}]), TEXT),
-    ("proxies of Anthropic: thinking part", assistant(content=[{"type": "thinking", "thinking": "{}"}, {"type": "text",
-        "text": TEXT}]), TEXT),
     ("gateways: a reasoning part that has a text", assistant(content=[{"type": "reasoning", "text": "{}"},
         {"type": "output_text", "text": TEXT}]), TEXT),
     ("gateways: parts without a type", assistant(content=[{"text": TEXT}]), TEXT),
     ("gateways: parts of other kinds", assistant(content=[{"type": "image_url"}, None, 3, {"type": "text", "text": 3}]),
         ""),
-    ("LiteLLM: a schema served by a function", assistant(content=None, tool_calls=[called(TEXT)]), ("no text",)),
+    ("LiteLLM: a schema served by a function", assistant(content=None, tool_calls=[{"function":
+        {"arguments": TEXT}}]), ("no text",)),
     ("OpenAI: refusal", assistant(content=None, refusal="I'm sorry, I can't help with that."),
         "I'm sorry, I can't help with that."),
     ("gateways: leading white space to keep the line open", b"\n\n  \n" + assistant(content=TEXT), TEXT),
@@ -188,30 +174,20 @@ THINK, FENCE, PROSE = "thinking_tags", "code_fence", "prose_around"
 TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     # whole and clean
     ("any model with a schema", TEXT, ()),
-    ("llama.cpp: indented", PRETTY + "\n", ()),
-    ("llama.cpp: leading blanks of the grammar", " \n\t" + TEXT, ()),
-    ("any model: unicode escapes", TEXT.replace("A ped", "\\u0041 ped"), ()),
+    ("llama.cpp: indented, after blanks", " \n\t" + PRETTY + "\n", ()),
     # thoughts
-    ("Qwen3: thoughts", f"<think>\nleft {{or}} right?\n</think>\n\n{TEXT}", (THINK,)),
-    ("Qwen3, thinking off: no thoughts", f"<think>\n\n</think>\n\n{TEXT}", (THINK,)),
     ("Qwen3: a draft among the thoughts", f"<think>I would say {DRAFT} but no</think>{TEXT}", (THINK,)),
     ("DeepSeek R1, Qwen3-Thinking: the opener is in the prompt", f"So I would say {DRAFT}, hm.\n</think>\n\n{TEXT}",
         (THINK,)),
-    ("GLM with thinking off: a closer at the beginning", f"</think>{TEXT}", (THINK,)),
     ("Kimi: nested thoughts", f"<think>a <think>b</think> c {DRAFT}</think>{TEXT}", (THINK,)),
     ("R1: speaks of the tag", f"<think>I must close with </think> in the end. {DRAFT}</think>{TEXT}", (THINK,)),
     ("any model: thoughts between two drafts", f"<think>a</think>{DRAFT}<think>no</think>{TEXT}", (THINK,)),
     ("DeepSeek: thoughts after the answer", f"{TEXT}\n<think>that should do</think>", "only_thinking"),
     ("R1, cut off: thoughts that never end", f"<think>So I would say {DRAFT} but", "only_thinking"),
     ("R1: thoughts alone", f"<think>So I would say {DRAFT}</think>", "only_thinking"),
-    ("Qwen3 on vLLM: the answer within the thoughts", f"{TEXT}\n</think>\n", "only_thinking"),
-    ("Claude by a proxy: thinking", f"<thinking>{DRAFT}</thinking>\n{TEXT}", (THINK,)),
-    ("Magistral: square brackets", f"[THINK]{DRAFT}[/THINK]{TEXT}", (THINK,)),
-    ("Command A: thoughts and response",
-        f"<|START_THINKING|>{DRAFT}<|END_THINKING|><|START_RESPONSE|>{TEXT}<|END_RESPONSE|>", (PROSE,)),
-    ("Granite 3.2: sentences for tags", f"Here is my thought process: {DRAFT} Here is my response: {TEXT}", (PROSE,)),
-    ("any model: tags in capitals", f"<THINK>{DRAFT}</Think>{TEXT}", (THINK,)),
-    ("any model: a tag with attributes", f'<reasoning effort="low">{DRAFT}</reasoning>{TEXT}', (THINK,)),
+    *((f"tags {begins}", f"{begins}{DRAFT}{ends}{TEXT}", (THINK,)) for begins, ends in (
+        ("<thinking>", "</thinking>"), ("<reasoning>", "</reasoning>"), ("<thought>", "</thought>"),
+        ("<THINK>", "</Think>"), ("[THINK]", "[/THINK]"), ("<|channel>thought\n", "<channel|>"))),
     ("InternVL, R1-V: think and answer", f"<think>x</think>\n<answer>\n{TEXT}\n</answer>", (THINK, PROSE)),
     ("Hunyuan: tags in the text of a field", changed(reasoning_trace=GOOD["reasoning_trace"] + " <think>"),
         GOOD["reasoning_trace"] + " <think>"),
@@ -219,22 +195,13 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("gpt-oss raw",
         f"<|channel|>analysis<|message|>{DRAFT}<|end|><|start|>assistant<|channel|>final<|message|>{TEXT}<|return|>",
         (THINK, PROSE)),
-    ("gpt-oss, special tokens left out", f"analysisWe need to answer. {DRAFT} Good.assistantfinal{TEXT}", (PROSE,)),
-    ("gpt-oss: the final channel alone", f"<|channel|>final<|message|>{TEXT}", (THINK, PROSE)),
     ("gpt-oss: never gets to the final channel", f"<|channel|>analysis<|message|>{DRAFT}<|end|>", "only_thinking"),
     ("gpt-oss: calls a function in the commentary",
         f"<|channel|>commentary to=functions.answer <|constrain|>json<|message|>{TEXT}<|call|>", "only_thinking"),
-    ("Gemma 4 raw", f"<|channel>thought\n{DRAFT}<channel|>{TEXT}", (THINK,)),
-    ("Gemma 4 raw: all of it is thought", f"<|channel>thought\n{TEXT}<channel|>", "only_thinking"),
-    ("Gemma 4, special tokens left out", f"thought\nI would say {DRAFT}\n{TEXT}", (PROSE,)),
-    ("ChatML servers: the template's marks", f"<|im_start|>assistant\n{TEXT}<|im_end|>", (PROSE,)),
-    ("Gemma, Mistral, Kimi-VL: end marks", f"{TEXT}<end_of_turn></s><|im_assistant|>", (PROSE,)),
     # fences, prose, drafts
     ("most models without a schema: a fence", f"```json\n{PRETTY}\n```", (FENCE,)),
     ("stopped at the fence: not opened", f"{TEXT}\n```", (FENCE,)),
     ("any model: a fence in a fence", f"````markdown\n```json\n{TEXT}\n```\n````", (FENCE, PROSE)),
-    ("Claude: draft and correction, each in a fence", f"```json\n{DRAFT}\n```\nWait, no:\n```json\n{TEXT}\n```", (FENCE,
-        PROSE)),
     ("any model: an example in a fence, then the answer", f"```json\n{{\"a\": 1}}\n```\n{TEXT}", (FENCE, PROSE)),
     ("any model: a fence in the text of a field",
         changed(reasoning_trace="As ```json {}``` shows, nothing has to change."),
@@ -246,12 +213,8 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("any model: a draft that breaks off", f"{HALF}\nLet me start again.\n{TEXT}", (PROSE,)),
     ("templates of Python: doubled braces", f"{{{TEXT}}}", (PROSE,)),
     ("vLLM, Qwen3 with thinking off: a brace too many", f"{{\n{TEXT}", (PROSE,)),
-    ("some models by OpenRouter: a brace too many in the end", f"{TEXT}\n}}", (PROSE,)),
-    ("GGUF of Gemma: BOM", "\ufeff" + TEXT, (PROSE,)),
     # wrapped
     ("Llama 3, Ollama: a function call as text", f'{{"name": "chain_of_cause", "parameters": {TEXT}}}', ("wrapped",)),
-    ("Hermes, Qwen: tool_call", f'<tool_call>\n{{"name": "answer", "arguments": {TEXT}}}\n</tool_call>', (PROSE,
-        "wrapped")),
     ("OpenAI shape: arguments as a text", json.dumps({"name": "answer", "arguments": TEXT}), ("wrapped",)),
     ("small models: the schema itself", json.dumps({"properties": {name: {"type": "string"} for name in GOOD}}),
         "field_not_text"),
@@ -260,7 +223,6 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     # as models write JSON
     ("any model: curly quotes in a text", changed(reasoning_trace="The “person” keeps to the middle of the image."),
         "The “person” keeps to the middle of the image."),
-    ("any model: bold in the keys", TEXT.replace("critical_components", "**critical_components**"), "missing_field"),
     ("any model: an escape that is none", TEXT.replace("person", "\\person"), "broken_json"),
     ("JavaScript habits: camel case", TEXT.replace("flight_decision", "flightDecision"), "missing_field"),
     ("small models: a key twice", TEXT[:-1] + ', "flight_decision": "hover"}', "duplicate_key"),
@@ -271,7 +233,6 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     # broken
     ("any server", "", "empty"),
     ("any model refuses", "I'm sorry, but I can't help with that.", "no_json_object"),
-    ("any model: markdown", "**Critical components**: a person.\n**Decision**: hover", "no_json_object"),
     ("any model: a list", '["hover"]', "no_json_object"),
     ("any server: cut off in a text", HALF, "broken_json"),
     ("any model: a draft, then cut off", f"{DRAFT}\nNo: {HALF}", "broken_json"),
@@ -352,10 +313,8 @@ DECISIONS: list[tuple[str, str | None]] = [
     ("track_straight", "track_straight"), ("Track-Straight", "track_straight"), ("TRACK STRAIGHT.", "track_straight"),
     ("trackStraight", "track_straight"), ('"track straight"', "track_straight"), ("`track_straight`", "track_straight"),
     ("**track_straight**", "track_straight"), ("track_straight...", "track_straight"),
-    ("track_straight()", None), ("Decision: hover", None), ("4. hover", None), ("飞行决策：hover", None),
-    ("", None), ("...", None), ("hover?", None), ("not hover", None), ("hover or ascend", None), ("hover, ascend", None),
-    ("hover (keep position)", None), ("hover now", None), ("悬停", None), ("A: hover", None), ("hov" * 50, None),
-    ("no_decision: hover", None), ("-hover-", None), ("!hover", None), ("hover\ud83d", None),
+    ("track_straight()", None), ("Decision: hover", None), ("4. hover", None), ("", None), ("hover?", None),
+    ("hover or ascend", None), ("悬停", None), ("hov" * 50, None), ("-hover-", None), ("hover\ud83d", None),
 ]  # fmt: skip
 
 
@@ -370,8 +329,6 @@ CUT = [
     (TEXT, "length", None), (f"```json\n{TEXT}\n```\n\n\n", "length", None), (HALF, "length", "cut_short"),
     ("", "length", "cut_short"), (f"So I would say {DRAFT}, but then the", "length", "cut_short"),
     (f"So I would say {DRAFT}, but then the", "MAX_TOKENS", "cut_short"),
-    (f"<think>So I would say {DRAFT}", "length", "cut_short"),
-    (f"analysisWe need to answer. {DRAFT} Goo", "length", "cut_short"),
     (changed(reasoning_trace="ok"), "length", "reasoning_trace_too_short"), ("", "content_filter", "content_filter"),
     (TEXT, "stop", None), (HALF, "stop", "broken_json"), (HALF, "tool_calls", "broken_json"),
 ]  # fmt: skip
