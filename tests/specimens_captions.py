@@ -77,8 +77,9 @@ def deciding(decision: str = "hover", fault=None, **options) -> TeacherServer:
     return TeacherServer(fault, decision=lambda body: decision, **options)
 
 
-def saying(text: Callable[[dict], str]) -> TeacherServer:
-    server = TeacherServer()
+def saying(text: Callable[[dict], str], fault=None) -> TeacherServer:
+    """A server whose text is `text(body)`."""
+    server = TeacherServer(fault)
     server.text = text
     return server
 

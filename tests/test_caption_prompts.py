@@ -16,7 +16,6 @@ from caption.stage.stage import run
 from caption.stage.windows import cut_windows
 from caption.teachers.prompt_files import (
     PROMPTS,
-    Vocabulary,
     export_prompts,
     own_prompts,
     shipped_prompts,
@@ -249,11 +248,6 @@ def flight(tree):
     return read_track(find_tracks(tree)[0])
 
 
-@pytest.fixture(scope="module")
-def vocabulary():
-    return Vocabulary(shipped_prompts())
-
-
 def window_of(flight):
     return next(cut_windows(flight, WindowConfig(require_images=False))).observed
 
@@ -263,9 +257,9 @@ def in_company(flight):
     return window_of(replace(flight, goal=GOAL, bystanders=rows))
 
 
-def test_a_prompt_tells_the_goal_and_the_others_in_both_languages(flight, vocabulary):
+def test_a_prompt_tells_the_goal_and_the_others_in_both_languages(flight):
     window = in_company(flight)
-    prompts = user_prompts(window, measure_facts(window), vocabulary)
+    prompts = user_prompts(window, measure_facts(window), RELATIVE)
     assert "\nGoal: follow the woman in the red jacket.\nOther people in view: [0, 1, 2, 3, 3];" in prompts["en"]
     assert "\n任务：跟踪穿红色夹克的女子。\n" in prompts["zh"]
     numbers = [re.findall(r"\d+(?:\.\d+)?", text.rpartition("\n")[2]) for text in prompts.values()]
@@ -274,9 +268,9 @@ def test_a_prompt_tells_the_goal_and_the_others_in_both_languages(flight, vocabu
         assert Prompt(system="", user=text).told("P", measured=False).user.count("\n") == 1
 
 
-def test_without_other_people_a_prompt_is_as_it_was(flight, vocabulary):
+def test_without_other_people_a_prompt_is_as_it_was(flight):
     plain, alone = window_of(flight), window_of(replace(flight, goal=GOAL))
-    told = [user_prompts(one, measure_facts(one), vocabulary) for one in (plain, alone)]
+    told = [user_prompts(one, measure_facts(one), RELATIVE) for one in (plain, alone)]
     assert told[0] == told[1]
 
 
@@ -288,7 +282,7 @@ def test_what_is_said_of_others_is_judged_by_the_geometry(flight):
     assert look_up(parse_reference("other_distance@t0"), facts) == "unknown_fact"
 
 
-def test_slots_of_other_people_are_filled(flight, vocabulary):
+def test_slots_of_other_people_are_filled(flight):
     facts, slots = measure_facts(in_company(flight)), FORMATS["slots"]
     text = "In view are {others_in_view}, the nearest {other_distance} away, with {alike_differences} that differ."
     draft = slots.read(Coc(critical_components=text, reasoning_trace="So be it.", flight_decision="hover"), facts)

@@ -30,52 +30,44 @@ from specimens import make_flight
 FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, -6.0, -10.0), offset_x_px=(0, 10, 40, None, -64))
 
 
-def filled(
-    text: str, language: Language = "en", facts: Facts = FACTS, decision: str = "yaw_right_to_follow"
-) -> str | Refused:
+def filled(text: str, language: Language, facts: Facts = FACTS) -> str | Refused:
     try:
-        return Filler(facts, decision, language).fill(read_sentence(text, language, len(facts)))
+        return Filler(facts, "yaw_right_to_follow", language).fill(read_sentence(text, language, len(facts)))
     except InvalidSlot as error:
         return Refused("invalid_slot", str(error))
 
 
-@each(("template", "text"), [
-    ("The gap {trend:distance} from {distance@t0} to {distance}.", "The gap decreases from 20.0 m to 18.0 m."),
-    ("The gap is now {trend:distance}.", "The gap is now decreasing."),
-    ("The gap has {trend:distance} to {distance}.", "The gap has decreased to 18.0 m."),
-    ("A {trend:speed} pace and a {trend:distance} gap.", "An increasing pace and a decreasing gap."),
-    ("It lies {offset_x} to the {side:offset_x} of the middle.", "It lies 64 px to the left of the middle."),
-    ("An offset of {offset_x} is large.", "An offset of -64 px is large."),  # no slot says its side
-    ("The nose swung {yaw} {side:yaw}, at {yaw_rate}.", "The nose swung 10.0 deg right, at -8.0 deg/s."),
-    ("It was {yaw@t2} to the {side:yaw@t2} at t2.", "It was 3.0 deg to the left at t2."),
-    ("The height {trend:altitude} by {change:altitude}.", "The height increases by 2.0 m."),
-    ("The box measures {box@t4} now, {box@t0} then.", "The box measures 36 x 72 px now, 30 x 60 px then."),
-    ("The box {trend:box_height} by {growth:box_height}.", "The box increases by 20%."),
-    ("Pitch is {pitch} here.", "Pitch is -40.3 deg here."),
-    ("It was {visibility@t3} at t3.", "It was occluded at t3."),
-    ("The drone is {comparison:speed} the walker.", "The drone is faster than the walker."),
-    ("The drone is {comparison:speed} than the walker.", "The drone is faster than the walker."),
-    ("The drone is {comparison:speed}.", "The drone is faster."),
-    ("The gap is {distance} m wide.", "The gap is 18.0 m wide."),  # the unit once
-    ("At {speed} m/s it flies.", "At 4.00 m/s it flies."),
-    ("It should {decision}, to the {side:decision}.", "It should yaw right to follow, to the right."),
-    ("{Distance @ t0} it was.", "20.0 m it was."),
-    ("The walker {target_motion} and is {target_motion}.", "The walker walks and is walking."),
+@each(("language", "template", "text"), [
+    ("en", "The gap {trend:distance} from {distance@t0} to {distance}.", "The gap decreases from 20.0 m to 18.0 m."),
+    ("en", "The gap is now {trend:distance}.", "The gap is now decreasing."),
+    ("en", "The gap has {trend:distance} to {distance}.", "The gap has decreased to 18.0 m."),
+    ("en", "A {trend:speed} pace and a {trend:distance} gap.", "An increasing pace and a decreasing gap."),
+    ("en", "It lies {offset_x} to the {side:offset_x} of the middle.", "It lies 64 px to the left of the middle."),
+    ("en", "An offset of {offset_x} is large.", "An offset of -64 px is large."),  # no slot says its side
+    ("en", "The nose swung {yaw} {side:yaw}, at {yaw_rate}.", "The nose swung 10.0 deg right, at -8.0 deg/s."),
+    ("en", "It was {yaw@t2} to the {side:yaw@t2} at t2.", "It was 3.0 deg to the left at t2."),
+    ("en", "The height {trend:altitude} by {change:altitude}.", "The height increases by 2.0 m."),
+    ("en", "The box measures {box@t4} now, {box@t0} then.", "The box measures 36 x 72 px now, 30 x 60 px then."),
+    ("en", "The box {trend:box_height} by {growth:box_height}.", "The box increases by 20%."),
+    ("en", "Pitch is {pitch} here.", "Pitch is -40.3 deg here."),
+    ("en", "It was {visibility@t3} at t3.", "It was occluded at t3."),
+    ("en", "The drone is {comparison:speed} the walker.", "The drone is faster than the walker."),
+    ("en", "The drone is {comparison:speed} than the walker.", "The drone is faster than the walker."),
+    ("en", "The drone is {comparison:speed}.", "The drone is faster."),
+    ("en", "The gap is {distance} m wide.", "The gap is 18.0 m wide."),  # the unit once
+    ("en", "At {speed} m/s it flies.", "At 4.00 m/s it flies."),
+    ("en", "It should {decision}, to the {side:decision}.", "It should yaw right to follow, to the right."),
+    ("en", "{Distance @ t0} it was.", "20.0 m it was."),
+    ("en", "The walker {target_motion} and is {target_motion}.", "The walker walks and is walking."),
+    ("zh", "水平距离从 {distance@t0}{trend:distance}到 {distance}。", "水平距离从 20.0 米减小到 18.0 米。"),
+    ("zh", "目标位于画面中心{side:offset_x}侧 {offset_x} 处。", "目标位于画面中心左侧 64 像素处。"),
+    ("zh", "边界框为 {box@t4}。", "边界框为 36 × 72 像素。"),
+    ("zh", "无人机{comparison:speed}目标，因此{decision}。", "无人机快于目标，因此向右偏航跟随。"),
+    ("zh", "t3 时目标{visibility@t3}。", "t3 时目标被遮挡。"),
+    ("zh", "高度为 {altitude} 米。", "高度为 22.0 米。"),
 ])  # fmt: skip
-def test_what_a_template_becomes(template, text):
-    assert filled(template) == text
-
-
-@each(("template", "text"), [
-    ("水平距离从 {distance@t0}{trend:distance}到 {distance}。", "水平距离从 20.0 米减小到 18.0 米。"),
-    ("目标位于画面中心{side:offset_x}侧 {offset_x} 处。", "目标位于画面中心左侧 64 像素处。"),
-    ("边界框为 {box@t4}。", "边界框为 36 × 72 像素。"),
-    ("无人机{comparison:speed}目标，因此{decision}。", "无人机快于目标，因此向右偏航跟随。"),
-    ("t3 时目标{visibility@t3}。", "t3 时目标被遮挡。"),
-    ("高度为 {altitude} 米。", "高度为 22.0 米。"),
-])  # fmt: skip
-def test_what_a_chinese_template_becomes(template, text):
-    assert filled(template, "zh") == text
+def test_what_a_template_becomes(language, template, text):
+    assert filled(template, language) == text
 
 
 REFUSED = [
@@ -212,12 +204,9 @@ def writing_server(english: str, corrected: str | None = None) -> TeacherServer:
     def text(body: dict) -> str:
         if is_mirror(body):
             wanted = json.loads(body["messages"][-1]["content"])["reasoning_trace"]
-            reasons = (
-                "距离为 {distance}，保持稳定，因此该动作可将其保持在画面内。"
-                if "{distance}" in wanted
-                else CHINESE["reasoning_trace"]
-            )
-            return json.dumps({**CHINESE, "reasoning_trace": reasons, "flight_decision": "hover"})
+            told = "距离为 {distance}，保持稳定，因此该动作可将其保持在画面内。"
+            reasons = {"reasoning_trace": told} if "{distance}" in wanted else {}
+            return json.dumps({**CHINESE, **reasons, "flight_decision": "hover"})
         reasons = corrected if corrected and len(body["messages"]) > 2 else english
         return json.dumps({**ENGLISH, "reasoning_trace": reasons, "therefore": "hover", "flight_decision": "hover"})
 

@@ -11,7 +11,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from specimens_captions import VOCABULARY
+from specimens_captions import VOCABULARY, report_of, saying
 from tables import each
 from teacher_server import TeacherServer, is_mirror, obedient_answer
 
@@ -66,7 +66,7 @@ def test_the_report_adds_up_and_repairs_stay_on_record(tree, tmp_path):
     cfg = CaptionConfig.model_validate({"repair": {"soft_conflict": "repair"}})
     done = run(cfg, tree, tmp_path / "out").parent
     captions = list(read_captions(done / "captions.jsonl"))
-    report = json.loads((done / "caption_report.json").read_text())
+    report = report_of(done)
     manifest = json.loads((done / "manifest.json").read_text())
     accepted = [caption for caption in captions if caption.status == "accepted"]
     dropped = Counter(caption.drop_reason for caption in captions if caption.status == "dropped")
@@ -142,7 +142,7 @@ def test_bad_flights_are_counted_and_the_others_captioned(tree, tmp_path):
     change_json(flights[2], lambda raw: raw["points"][3]["drone_pose"].update(x=None))
     (folders[5] / "frames_playback" / "frame_00006" / "rgb.png").unlink()
     out = run(CaptionConfig(), root, tmp_path / "out").parent
-    report = json.loads((out / "caption_report.json").read_text())
+    report = report_of(out)
     # Two that cannot be read, and the perturbed flight beside the second, whose labels come from it.
     assert report["flights"] == {"input": 6, "kept": 2, "dropped": {"too_short": 1}, "failed": {"input": 3}}
     # Frame 6 is observed by the windows at 6..10, of those at 4..12.
@@ -164,13 +164,12 @@ def test_a_perturbed_flight_waits_for_a_clean_one_that_cannot_be_read(tmp_path):
     assert Counter(caption.label_from for caption in found) == {"flight": 5, "twin": 5}
 
 
-@pytest.mark.parametrize("name", ["glossary"])
-def test_captions_of_another_prompt_are_refused_by_name(tree, tmp_path, monkeypatch, name):
+def test_captions_of_another_prompt_are_refused_by_name(tree, tmp_path, monkeypatch):
     shutil.copytree(run(CaptionConfig(), tree, tmp_path / "first").parent, tmp_path / "out")
     changed = tmp_path / "changed"
     changed.write_text("otherwise")
-    monkeypatch.setitem(stage.PACKAGE_FILES, name, changed)
-    with pytest.raises(ResumeError, match=f"the {name} has changed"):
+    monkeypatch.setitem(stage.PACKAGE_FILES, "glossary", changed)
+    with pytest.raises(ResumeError, match="the glossary has changed"):
         run(CaptionConfig(), tree, tmp_path / "out")
 
 
@@ -247,18 +246,6 @@ def test_a_comparison_by_hand():
     assert [one.row[:4] for one in (found, nothing)] == [("hint", "2", "33.3 %", "62.5 %"), ("hint", "0", "0.0 %", "-")]
 
 
-def judging_server(answer, fault=None):
-    """A chat server whose text is `answer(body)`."""
-    server = TeacherServer(fault)
-    server.text = answer
-    return server
-
-
-@pytest.fixture(scope="module")
-def two_flights(tmp_path_factory):
-    return make_playback_tree(tmp_path_factory.mktemp("tree"), 2, 18)
-
-
 @each(("text", "verdict"), [
     ('{"verdict": "FIX_LABEL", "reason": "the text argues for the label"}', "FIX_LABEL"),
     ('```json\n{"verdict": "REJECT_REGEN", "reason": "wrong"}\n```', "REJECT_REGEN"),
@@ -282,27 +269,23 @@ def teacher_in_conflict(**options) -> TeacherServer:
 
     def text(body: dict) -> str:
         answer = obedient_answer(server, body)
-        named = (
-            "因此应{decision}，使目标留在画面中。"
-            if is_mirror(body)
-            else "So the drone should {decision} in this case."
-        )
-        return json.dumps(answer | {"reasoning_trace": named})
+        chinese, english = "因此应{decision}，使目标留在画面中。", "So the drone should {decision} in this case."
+        return json.dumps(answer | {"reasoning_trace": chinese if is_mirror(body) else english})
 
     server.text = text
     return server
 
 
-def judged(two_flights, out, answer, **settings):
-    with judging_server(answer) as server, teacher_in_conflict() as teacher:
+def judged(tree, out, answer, **settings):
+    with saying(answer) as server, teacher_in_conflict() as teacher:
         cfg = {"teacher": teacher.url, "judge": {"url": server.url, **settings}, "image": {"max_side_px": 32}}
-        path = run(CaptionConfig.model_validate(cfg), two_flights, out)
-        return list(read_captions(path)), json.loads((out / "caption_report.json").read_text()), server
+        path = run(CaptionConfig.model_validate(cfg), tree, out)
+        return list(read_captions(path)), report_of(out), server
 
 
-def test_a_hard_conflict_stays_one_whatever_the_judge_says(two_flights, tmp_path):
+def test_a_hard_conflict_stays_one_whatever_the_judge_says(tree, tmp_path):
     accept = '{"verdict": "ACCEPT_ALTERNATIVE", "reason": "looks fine"}'
-    captions, report, server = judged(two_flights, tmp_path / "out", lambda body: accept)
+    captions, report, server = judged(tree, tmp_path / "out", lambda body: accept)
     hard = [c for c in captions if c.repair]
     soft = [c for c in captions if c.judge and not c.repair]
     assert hard, "the specimens must hold a hard conflict"
@@ -313,11 +296,11 @@ def test_a_hard_conflict_stays_one_whatever_the_judge_says(two_flights, tmp_path
     assert len(server.bodies) == len(hard) + len(soft)  # consistent answers are not judged
 
 
-def test_a_label_is_put_in_where_the_text_allows_it(two_flights, tmp_path):
+def test_a_label_is_put_in_where_the_text_allows_it(tree, tmp_path):
     fix = '{"verdict": "FIX_LABEL", "reason": "replace it"}'
-    with TeacherServer(decision=lambda body: "hover") as teacher, judging_server(lambda body: fix) as judge:
+    with TeacherServer(decision=lambda body: "hover") as teacher, saying(lambda body: fix) as judge:
         cfg = CaptionConfig.model_validate({"teacher": teacher.url, "judge": {"url": judge.url}})
-        captions = list(read_captions(run(cfg, two_flights, tmp_path / "out")))
+        captions = list(read_captions(run(cfg, tree, tmp_path / "out")))
     fixed = [c for c in captions if c.repair]
     assert fixed
     for caption in fixed:
@@ -326,28 +309,27 @@ def test_a_label_is_put_in_where_the_text_allows_it(two_flights, tmp_path):
         assert caption.en.flight_decision == caption.zh.flight_decision == caption.label
 
 
-def test_a_label_is_not_put_under_a_text_that_states_another_decision(two_flights, tmp_path):
-    captions, _, _ = judged(
-        two_flights, tmp_path / "out", lambda body: '{"verdict": "FIX_LABEL", "reason": "replace it"}'
-    )
+def test_a_label_is_not_put_under_a_text_that_states_another_decision(tree, tmp_path):
+    fix = '{"verdict": "FIX_LABEL", "reason": "replace it"}'
+    captions, _, _ = judged(tree, tmp_path / "out", lambda body: fix)
     asked = [c for c in captions if c.judge]  # of the rule teacher, whose text names its decision
     assert asked
     assert all(c.judge.overruled_by == "text" and c.repair.rung == "anchored" for c in asked)
 
 
-def test_a_judges_tokens_count_in_the_budget_and_are_shown(two_flights, tmp_path):
+def test_a_judges_tokens_count_in_the_budget_and_are_shown(tree, tmp_path):
     out, reject = tmp_path / "out", '{"verdict": "REJECT_REGEN", "reason": "no"}'
     # Each answer, also of the judge: 1,000 tokens in, 100 out.
-    with judging_server(lambda body: reject) as server, teacher_in_conflict() as teacher:
+    with saying(lambda body: reject) as server, teacher_in_conflict() as teacher:
         settings = {"teacher": teacher.url, "judge": {"url": server.url, "concurrency": 1}}
-        whole = run(CaptionConfig.model_validate(settings), two_flights, tmp_path / "other").read_bytes()
+        whole = run(CaptionConfig.model_validate(settings), tree, tmp_path / "other").read_bytes()
         num_asked = len(server.bodies)
         limit = 1100 * (len(teacher.bodies) + 1)  # enough for the teacher alone
         with pytest.raises(TeacherError, match="captioning stopped, because the budget is spent"):
-            run(CaptionConfig.model_validate(settings | {"budget": {"max_tokens": limit}}), two_flights, out)
-        assert run(CaptionConfig.model_validate(settings), two_flights, out).read_bytes() == whole
+            run(CaptionConfig.model_validate(settings | {"budget": {"max_tokens": limit}}), tree, out)
+        assert run(CaptionConfig.model_validate(settings), tree, out).read_bytes() == whole
         assert len(server.bodies) == 2 * num_asked  # what was judged before the budget stopped was not asked again
-        report = json.loads((out / "caption_report.json").read_text())
+        report = report_of(out)
     assert report["judge_tokens"] == {"prompt_tokens": 1000 * num_asked, "completion_tokens": 100 * num_asked}
     assert f"{1000 * num_asked:,} in, {100 * num_asked:,} out" in (out / "report.html").read_text(encoding="utf-8")
 
@@ -362,7 +344,7 @@ def test_the_check_tells_a_perfect_judge_and_one_that_always_says_the_same():
         def wait(number, body):
             together.wait(60)
 
-        with judging_server(lambda body: json.dumps({"verdict": answer(body), "reason": "because"}), wait) as server:
+        with saying(lambda body: json.dumps({"verdict": answer(body), "reason": "because"}), wait) as server:
             found = asyncio.run(check_judge(JudgeConfig(url=server.url), VOCABULARY, gold))
         return found.agreement, found.num_unjudged, found.num_moved, found.first_share
 
