@@ -443,15 +443,15 @@ DEFECTS = [
 ]
 
 
-def test_an_answer_in_parts_is_read_and_a_null_field_is_left_out():
-    findings = examine(patient(in_parts=True, takes_null=False), endpoint={"extra_body": {"temperature": None}})
+@each(("defects", "settings", "name", "words"), [
+    ({"in_parts": True, "takes_null": False}, {"endpoint": {"extra_body": {"temperature": None}}}, "answers", ""),
+    ({"refuses_schema": True}, {"endpoint": {"json_schema": False}}, "JSON schema", "switched off"),
+    ({"max_images": 0}, {"image": {"modalities": []}}, "answers", ""),
+])  # fmt: skip
+def test_what_the_settings_do_without_is_no_defect(defects, settings, name, words):
+    findings = examine(patient(**defects), **settings)
     assert {finding.state for finding in findings.values()} == {"ok"}
-
-
-def test_a_schema_that_is_switched_off_is_not_sent():
-    findings = examine(patient(refuses_schema=True), endpoint={"json_schema": False})
-    assert {finding.state for finding in findings.values()} == {"ok"}
-    assert "switched off" in findings["JSON schema"].detail
+    assert words in findings[name].detail
 
 
 @each(("defect", "name", "state", "words"), DEFECTS, ids=lambda value: str(value))
@@ -472,11 +472,6 @@ def test_a_slow_answer_to_the_largest_prompt_is_no_matter_of_the_context():
     assert findings["speed"].state == "unusable"
     assert "caption.endpoint.timeout_s=6" in findings["speed"].detail
     assert re.search(r"At [\d.]+ tokens/s, as in the first answer, 1024 tokens .* take \d+ s", findings["speed"].detail)
-
-
-def test_an_examination_without_pictures():
-    findings = examine(patient(max_images=0), image={"modalities": []})
-    assert {finding.state for finding in findings.values()} == {"ok"}
 
 
 @each("defect", [{}, {"refuses_schema": True}], ids=str)  # a refused schema is a request, too
