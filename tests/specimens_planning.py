@@ -1,12 +1,13 @@
 """Hand-made worlds for planners, and the check that a flight through them is safe."""
 
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 
-from cosfly.formats.boxes import MapHeader, make_box_map
+from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.pedestrian_paths import PedestrianTrajectory
+from cosfly.formats.pedestrian_paths import PedestrianTrajectory, write_paths
 from cosfly.geometry import kernels
 from cosfly.geometry.axes import DT_S
 from cosfly.planners.contract import PlanConfig, TrackingReference
@@ -43,6 +44,14 @@ WORLDS = {
     "corner": (town_of(((-20, 20, 25), (30, 12, 25)), ((40, 40, 25), (12, 40, 25))), [(-30, 0), (20, 2), (22, 70)]),
     "short": (town_of(((10, 9, 5), (2, 2, 5))), [(0, 0), (1.3, 0)]),  # three points
 }  # fmt: skip
+
+
+def written(folder: Path, box_map: BoxMap, **walks: list[tuple]) -> tuple[Path, Path]:
+    """Write a map and walks of these names and corners, and give both files."""
+    write_boxes(folder / "map.json", box_map)
+    made = [walk_along(name, corners) for name, corners in walks.items()]
+    write_paths(folder / "path.json", made, {"map": "hand", "seed": 0})
+    return folder / "map.json", folder / "path.json"
 
 
 def scenario_of(world):

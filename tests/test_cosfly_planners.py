@@ -13,12 +13,10 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
-from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenario_of, town_of, walk_along
+from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenario_of, town_of, walk_along, written
 from tables import each
 
 import cosfly.planners.stage as planners
-from cosfly.formats.boxes import write_boxes
-from cosfly.formats.pedestrian_paths import write_paths
 from cosfly.formats.traces import read_traces
 from cosfly.geometry import kernels, trajectory_metrics
 from cosfly.geometry import trajectory_metrics as metrics
@@ -73,13 +71,13 @@ def plain_terms(points, problem, obstacles):
     return terms
 
 
-def shaken(world, seed=3):
+def shaken(world):
     scenario, obstacles = scenario_of(world)
     problem = muco.make_problem(scenario, CFG)
     points = replace(scenario.reference, ground_distance_m=np.full(len(scenario.targets_m), 18.0)).places_m(
         scenario.targets_m, scenario.ground_m + 1.0
     )
-    points += np.random.default_rng(seed).normal(0, 2.5, points.shape)
+    points += np.random.default_rng(3).normal(0, 2.5, points.shape)
     return points, problem, obstacles
 
 
@@ -207,15 +205,11 @@ def test_the_prefilter_has_three_rules_of_motion_and_sight(name):
     assert planners.drop_reason(worse, CFG, True) == expected[name]
 
 
-def test_stage_counts_failures_and_does_the_others(tmp_path, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("inputs")
-    write_boxes(folder / "map.json", town_of(*CANYON, ((60, -40, 20), (5, 5, 20))))
-    walks = [
-        walk_along("a", [(0, 0), (40, 0)]), walk_along("b", [(30, 2), (70, 2), (72, -2)]),
-        walk_along("into_wall", [(60, -50), (60, -30)]), walk_along("c", [(90, 0), (50, 0)]),
-    ]  # fmt: skip
-    write_paths(folder / "path.json", walks, {"map": "hand", "seed": 0})
-    inputs = folder / "map.json", folder / "path.json"
+def test_stage_counts_failures_and_does_the_others(tmp_path):
+    inputs = written(
+        tmp_path, town_of(*CANYON, ((60, -40, 20), (5, 5, 20))), a=[(0, 0), (40, 0)],
+        b=[(30, 2), (70, 2), (72, -2)], into_wall=[(60, -50), (60, -30)], c=[(90, 0), (50, 0)],
+    )  # fmt: skip
     product = planners.run(CFG, *inputs, tmp_path / "plan")
     traces = read_traces(product)
     assert [trace.path_id for trace in traces] == ["a", "b", "c"]
@@ -435,9 +429,7 @@ def test_a_route_exists_exactly_within_a_part_of_four_neighbours():
 
 
 @settings(max_examples=80)
-@given(
-    st.integers(0, 10**9), st.integers(1, 22), st.integers(1, 22), st.floats(0.0, 0.55), st.booleans()
-)  # fmt: skip
+@given(st.integers(0, 10**9), st.integers(1, 22), st.integers(1, 22), st.floats(0.0, 0.55), st.booleans())
 def test_costs_are_the_optimum_of_another_library(seed, num_x, num_y, density, is_uniform):
     rng = np.random.default_rng(seed)
     free = rng.random((num_y, num_x)) >= density
@@ -461,14 +453,13 @@ def test_costs_are_the_optimum_of_another_library(seed, num_x, num_y, density, i
         assert route_cost(find_route(free, goal, start)) == pytest.approx(optimum, abs=1e-9)
 
 
-def random_boxes(rng, count, size_m=40.0):
+def random_boxes(rng, count):
     turn = rng.uniform(-np.pi, np.pi, count)
     rotations = np.zeros((count, 3, 3))
     rotations[:, 0, 0] = rotations[:, 1, 1] = np.cos(turn)
     rotations[:, 1, 0], rotations[:, 0, 1], rotations[:, 2, 2] = np.sin(turn), -np.sin(turn), 1.0
-    return kernels.index_boxes(
-        rng.uniform(-size_m, size_m, (count, 3)) * [1, 1, 0.3] + [0, 0, 10], rng.uniform(0.2, 6, (count, 3)), rotations
-    )
+    centers = rng.uniform(-40, 40, (count, 3)) * [1, 1, 0.3] + [0, 0, 10]
+    return kernels.index_boxes(centers, rng.uniform(0.2, 6, (count, 3)), rotations)
 
 
 @settings(max_examples=40)

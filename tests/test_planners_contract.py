@@ -6,12 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from specimens_planning import CANYON, WORLDS, assert_safe, town_of, walk_along
+from specimens_planning import CANYON, WORLDS, assert_safe, town_of, walk_along, written
 from tables import each
 
-from cosfly.formats.boxes import write_boxes
 from cosfly.formats.frames import Camera
-from cosfly.formats.pedestrian_paths import write_paths
 from cosfly.formats.traces import read_traces
 from cosfly.geometry import kernels
 from cosfly.geometry.axes import DT_S, intrinsic_matrix, look_at, project, world_from_camera, wrap_deg
@@ -149,17 +147,16 @@ def test_an_unknown_planner_is_named():
         PlanConfig(planner="mucco")
 
 
-STEP_S = 0.5
 OPEN = kernels.obstacle_index(town_of())
 STRAIGHT = walk_along("straight", [(0, 0), (90, 0)])
 CAMERA = Camera(640, 360, intrinsic_matrix(640, 360, 60.0))
 GIMBAL = GimbalConfig(bandwidth_hz=0.2, delay_s=0.2, error_deg=4.0)
 
 
-def overhead(aside_m=0.5, height_m=21.0):
+def overhead(aside_m):
     """A target that passes under a drone at 2 m/s: drone and target, (n, 3)."""
     target = np.column_stack([np.arange(-20.0, 21.0), np.full(41, aside_m), np.zeros(41)])
-    return np.tile([0.0, 0.0, height_m], (41, 1)), target
+    return np.tile([0.0, 0.0, 21.0], (41, 1)), target
 
 
 def pixels(drone, target, pitch, yaw):
@@ -169,12 +166,12 @@ def pixels(drone, target, pitch, yaw):
 
 
 def rates_degps(yaw):
-    return np.abs(wrap_deg(np.degrees(np.diff(yaw)))) / STEP_S
+    return np.abs(wrap_deg(np.degrees(np.diff(yaw)))) / DT_S
 
 
 def test_a_direction_within_the_limit_stays_as_it_is():
-    pitch, yaw = look_at(*overhead(aside_m=40.0))
-    limited = limit_yaw_rate(pitch, yaw, 60.0, STEP_S)
+    pitch, yaw = look_at(*overhead(40.0))
+    limited = limit_yaw_rate(pitch, yaw, 60.0, DT_S)
     assert limited[0] is pitch
     assert limited[1] is yaw
 
@@ -184,7 +181,7 @@ def test_a_camera_that_passes_over_its_target_turns_slowly_and_keeps_it_in_the_p
     drone, target = overhead(aside_m)
     pitch, yaw = look_at(drone, target)
     assert rates_degps(yaw).max() > 60.0
-    limited = limit_yaw_rate(pitch, yaw, 60.0, STEP_S)
+    limited = limit_yaw_rate(pitch, yaw, 60.0, DT_S)
     assert rates_degps(limited[1]).max() <= 60.0 + 1e-9
     uv = pixels(drone, target, *limited)
     assert ((uv > 0) & (uv < [CAMERA.width_px, CAMERA.height_px])).all()
@@ -192,9 +189,9 @@ def test_a_camera_that_passes_over_its_target_turns_slowly_and_keeps_it_in_the_p
 
 
 def test_the_gimbal_lags_behind_a_target_that_moves_through_the_picture():
-    yaw = np.radians(10.0 * STEP_S * np.arange(60))
+    yaw = np.radians(10.0 * DT_S * np.arange(60))
     exact = GIMBAL.model_copy(update={"error_deg": 0.0})
-    pitch, followed = follow_direction(0.0 * yaw, yaw, exact, 60.0, STEP_S, np.random.default_rng(0))
+    pitch, followed = follow_direction(0.0 * yaw, yaw, exact, 60.0, DT_S, np.random.default_rng(0))
     # A loop without feed-forward lags by rate x (2 x damping / natural frequency + delay).
     lag_s = 2.0 * GIMBAL.damping / (2.0 * np.pi * GIMBAL.bandwidth_hz) + GIMBAL.delay_s
     assert wrap_deg(np.degrees(yaw - followed))[-1] == pytest.approx(10.0 * lag_s, rel=0.05)
@@ -203,7 +200,7 @@ def test_the_gimbal_lags_behind_a_target_that_moves_through_the_picture():
 
 def test_the_aiming_error_has_its_standard_deviation_and_is_smooth():
     still = np.zeros(20_000)
-    pitch, yaw = follow_direction(still, still, GIMBAL, 60.0, STEP_S, np.random.default_rng(0))
+    pitch, yaw = follow_direction(still, still, GIMBAL, 60.0, DT_S, np.random.default_rng(0))
     assert np.degrees(yaw.std()) == pytest.approx(4.0, rel=0.1)
     assert np.degrees(pitch.std()) == pytest.approx(2.0, rel=0.1)
     assert rates_degps(yaw).max() < 5.0
@@ -211,7 +208,7 @@ def test_the_aiming_error_has_its_standard_deviation_and_is_smooth():
 
 def test_the_gimbal_turns_no_faster_than_the_limit():
     yaw = np.where(np.arange(40) < 20, 0.0, 2.5)
-    _, followed = follow_direction(0.0 * yaw, yaw, GIMBAL, 30.0, STEP_S, np.random.default_rng(0))
+    _, followed = follow_direction(0.0 * yaw, yaw, GIMBAL, 30.0, DT_S, np.random.default_rng(0))
     assert 25.0 < rates_degps(followed).max() <= 30.0 + 1e-9
 
 
@@ -235,9 +232,9 @@ def test_new_settings_are_recorded_only_where_they_are_set():
 
 @pytest.mark.parametrize("correlation_s", [1.0, 6.0])
 def test_smooth_draws_have_the_stated_covariance(correlation_s):
-    drawn = draw_smooth(100_000, 2, STEP_S, correlation_s, np.random.default_rng(0))
+    drawn = draw_smooth(100_000, 2, DT_S, correlation_s, np.random.default_rng(0))
     np.testing.assert_allclose(drawn.std(axis=0), 1.0, rtol=0.03)
-    steps = round(correlation_s / STEP_S)
+    steps = round(correlation_s / DT_S)
     found = (drawn[steps:] * drawn[:-steps]).mean(axis=0)
     np.testing.assert_allclose(found, np.exp(-0.5), atol=0.05)
     assert abs((drawn[:, 0] * drawn[:, 1]).mean()) < 0.05
@@ -261,11 +258,8 @@ def test_every_planner_has_its_group():
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
     """A walk round a corner, through whose block minimum jerk finds no way, and one along a wall."""
-    folder, (box_map, corners) = tmp_path_factory.mktemp("inputs"), WORLDS["corner"]
-    write_boxes(folder / "map.json", box_map)
-    walks = [walk_along("round", corners), walk_along("along", [(-30, 0), (0, 0)])]
-    write_paths(folder / "path.json", walks, {"map": "hand", "seed": 0})
-    return folder / "map.json", folder / "path.json"
+    box_map, corners = WORLDS["corner"]
+    return written(tmp_path_factory.mktemp("inputs"), box_map, round=corners, along=[(-30, 0), (0, 0)])
 
 
 @pytest.fixture(scope="module")
@@ -369,15 +363,8 @@ def test_deltas_are_the_papers():
 
 @pytest.fixture(scope="module")
 def canyon(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("inputs")
-    write_boxes(folder / "map.json", town_of(*CANYON, ((60, -40, 20), (5, 5, 20))))
-    walks = [
-        walk_along("a", [(0, 0), (30, 0)]),
-        walk_along("into_wall", [(60, -50), (60, -30)]),
-        walk_along("b", [(30, 2), (60, 2)]),
-    ]
-    write_paths(folder / "path.json", walks, {"map": "hand", "seed": 0})
-    return folder / "map.json", folder / "path.json"
+    walks = {"a": [(0, 0), (30, 0)], "into_wall": [(60, -50), (60, -30)], "b": [(30, 2), (60, 2)]}
+    return written(tmp_path_factory.mktemp("inputs"), town_of(*CANYON, ((60, -40, 20), (5, 5, 20))), **walks)
 
 
 def test_the_record_is_what_the_flights_are(canyon, tmp_path_factory):
