@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from commands import invoke
 from test_cosfly_render import needs_gl
-from test_render_camera import IN_THE_WALL
 from test_renderers_contract import circling, write_inputs
 from toy_workers import make_counting_worker, stage_in
 
@@ -67,7 +66,9 @@ def test_a_longer_lens_shows_the_middle_as_large():
 @needs_gl
 def test_the_target_grows_as_the_lens_does(tmp_path_factory, in_this_process):
     folder = tmp_path_factory.mktemp("study")
-    boxes, simplified, traces = write_inputs(folder / "inputs", [circling(6), circling(5, "path_002"), IN_THE_WALL])
+    in_the_wall = circling(4, "path_001")
+    in_the_wall.positions_m[2] = (-6.0, -16.0, 0.5)
+    boxes, simplified, traces = write_inputs(folder / "inputs", [circling(6), circling(5, "path_002"), in_the_wall])
     words = f"study zoom --map {boxes} --simplified {simplified} --traces {traces} --out {folder / 'out'} --every 2"
     settings = f"max_failed=1 render.fovs_deg={LEVELS} render.width_px=640 render.height_px=360".replace(", ", ",")
     sets = [word for setting in settings.split() for word in ("--set", setting)]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tables import each
 from test_cosfly_render import needs_gl
-from test_renderers_contract import HIP, circling, opened, pose_towards, street, write_inputs
+from test_renderers_contract import WALKER, circling, opened, pose_towards, street, write_inputs
 
 from cosfly.formats.boxes import MapHeader, make_box_map
 from cosfly.formats.frames import (
@@ -24,17 +24,14 @@ from cosfly.formats.frames import (
 )
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback import read_track, write_track
-from cosfly.formats.traces import DroneTrace
 from cosfly.formats.tracks import find_tracks
 from cosfly.formats.weather import TIMES, WEATHERS, WeatherParams, resolved
 from cosfly.geometry.axes import intrinsic_matrix
 from cosfly.pipeline.runs import small_targets
 from cosfly.pipeline.settings import RunConfig
 from cosfly.render.camera import ZoomConfig, legibility, zoomed_deg
-from cosfly.render.contract import PosedPerson
-from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
-from cosfly.render.stage import open_renderer, run
+from cosfly.render.stage import run
 from cosfly.render.weather import path_seed, read_pools, weather_of
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import ConfigError
@@ -73,10 +70,10 @@ def test_a_flight_goes_from_level_to_level():
     assert focal[22] == pytest.approx(np.sqrt(focal[20] * focal[24])), "halfway the picture is halfway larger"
 
 
-def zooming(num_points: int = 8):
-    flight, _ = make_flight(num_points)
-    intrinsics = np.tile(flight.camera.intrinsic, (num_points, 1, 1))
-    intrinsics[:, [0, 1], [0, 1]] *= np.linspace(1.0, 2.0, num_points)[:, None]
+def zooming():
+    flight, _ = make_flight(8)
+    intrinsics = np.tile(flight.camera.intrinsic, (8, 1, 1))
+    intrinsics[:, [0, 1], [0, 1]] *= np.linspace(1.0, 2.0, 8)[:, None]
     return replace(flight, intrinsics=intrinsics)
 
 
@@ -124,18 +121,8 @@ def test_every_frame_tells_the_camera_it_was_drawn_with(zoomed_tree):
             assert meta.focal_length_35mm_mm == pytest.approx(camera.focal_35mm_mm, abs=1e-6)
 
 
-def moved(trace: DroneTrace, name: str, frame: int, place: tuple[float, float, float]) -> DroneTrace:
-    places = getattr(trace, name).copy()
-    places[frame] = place
-    return replace(trace, **{name: places})
-
-
-IN_THE_WALL = moved(circling(4, "path_001"), "positions_m", 2, (-6.0, -16.0, 0.5))
-
-
 SIZE = (320, 180)
 RANDOM = {"weather_mode": "random_per_path"}
-STREET = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0], "town": "Street", "first_timestamp": 1776000000}
 
 
 def config(**settings) -> RenderConfig:
@@ -231,13 +218,11 @@ def town():
 
 
 POSE = pose_towards((-14.0, -16.0, 8.0), (12.0, 2.0, 2.0))
-WALKER = PosedPerson(HIP, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
 
 
 @pytest.fixture(scope="module")
 def renderer():
-    opened("gl", street()).close()  # skips where it cannot run
-    renderer = open_renderer("gl", town(), *SIZE)
+    renderer = opened("gl", town())  # skips where it cannot run
     yield renderer
     renderer.close()
 
@@ -274,7 +259,7 @@ def trees(tmp_path_factory):
     folder = tmp_path_factory.mktemp("weather")
     inputs = write_inputs(folder / "in", [circling(3, f"path_{k:03d}") for k in range(3)])
     return [
-        run(config(**STREET, **settings), *inputs, folder / name, seed=5)
+        run(config(**SMALL, fovs_deg=[60.0], **settings), *inputs, folder / name, seed=5)
         for name, settings in (("off", {}), ("random", RANDOM))
     ], inputs
 

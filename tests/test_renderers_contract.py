@@ -59,9 +59,11 @@ from cosfly.runtime.errors import EnvironmentMissing, RenderError
 from cosfly.viz.frame_views import PEDESTRIAN_RGB, read_view
 
 SIZE = (320, 180)
+DRAWN = {"width_px": 320, "height_px": 180, "fovs_deg": [60.0], "town": "Street", "first_timestamp": 1776000000}
 DEPTH_TOLERANCE_M = 0.001  # within 60 m
 VISIBILITY_TOLERANCE = 0.02  # figures differ, and where the person itself is drawn its box is visible
 HIP = np.array([4.0, -3.0, 0.9])
+WALKER = PosedPerson(HIP, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
 
 
 def street(offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> BoxMap:
@@ -80,25 +82,28 @@ def street(offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> BoxMap:
     )  # fmt: skip
 
 
-def circling(n: int = 6, path_id: str = "path_000", drop_reason: str | None = None) -> DroneTrace:
-    """A person walks along the pavement, the drone circles."""
+def along_the_pavement(away_m: np.ndarray, path_id: str, drop_reason: str | None = None) -> DroneTrace:
+    """A person walks along the pavement, the drone flies at these offsets, (n, 3)."""
+    n = len(away_m)
     t = np.arange(n) * 0.5
     targets = np.stack([-8.0 + 1.3 * t, np.full(n, -9.0), np.full(n, 1.0)], axis=1)
-    angle = 0.15 * t - 1.0
-    drones = targets + np.stack([9.0 * np.cos(angle), 9.0 * np.sin(angle), np.full(n, 6.0)], axis=1)
+    drones = targets + away_m
     pitch, yaw = look_at(drones, targets)
     rotations = np.degrees(np.stack([pitch, yaw, 0.0 * pitch], axis=1))
     return DroneTrace(path_id, "hand", t, drones, rotations, targets, np.ones(n), np.ones(n), drop_reason=drop_reason)
 
 
-def behind_a_wall(n: int = 8) -> DroneTrace:
+def circling(n: int = 6, path_id: str = "path_000", drop_reason: str | None = None) -> DroneTrace:
+    """The drone circles."""
+    angle = 0.15 * 0.5 * np.arange(n) - 1.0
+    away = np.stack([9.0 * np.cos(angle), 9.0 * np.sin(angle), np.full(n, 6.0)], axis=1)
+    return along_the_pavement(away, path_id, drop_reason)
+
+
+def behind_a_wall() -> DroneTrace:
     """The drone sinks on the other side of a wall until the person is hidden."""
-    t = np.arange(n) * 0.5
-    targets = np.stack([-8.0 + 1.3 * t, np.full(n, -9.0), np.full(n, 1.0)], axis=1)
-    drones = targets + np.stack([np.zeros(n), np.full(n, -13.0), np.linspace(5.0, -0.4, n)], axis=1)
-    pitch, yaw = look_at(drones, targets)
-    rotations = np.degrees(np.stack([pitch, yaw, 0.0 * pitch], axis=1))
-    return DroneTrace("path_007", "hand", t, drones, rotations, targets, np.ones(n), np.ones(n))
+    away = np.stack([np.zeros(8), np.full(8, -13.0), np.linspace(5.0, -0.4, 8)], axis=1)
+    return along_the_pavement(away, "path_007")
 
 
 def write_inputs(folder: Path, traces: list[DroneTrace]) -> list[Path]:
@@ -158,9 +163,9 @@ def renderer_name(request):
     return request.param
 
 
-def opened(name: str, box_map: BoxMap):
+def opened(name: str, box_map: BoxMap, **options):
     try:
-        return open_renderer(name, box_map, *SIZE)
+        return open_renderer(name, box_map, *SIZE, **options)
     except EnvironmentMissing as error:
         pytest.skip(str(error))
 
@@ -224,10 +229,8 @@ def test_of_coplanar_surfaces_the_higher_layer_is_seen(renderer_name):
 def test_of_coplanar_surfaces_of_one_kind_always_the_same_one_is_seen(renderer_name):
     """Where roads cross at one height, a depth buffer alone lets rounding decide: stripes of both (Z-fighting)."""
     roads = [KINDS["Roads"]] * 3  # the third, which one of them meets elsewhere, needs no third tier
-    centers, halves = (
-        [(0, 0, -0.15), (-5, 0, -0.15), (-5, 40, -0.15)],
-        [(90, 4.5, 0.15), (60, 4, 0.15), (90, 4.5, 0.15)],
-    )
+    centers = [(0, 0, -0.15), (-5, 0, -0.15), (-5, 40, -0.15)]
+    halves = [(90, 4.5, 0.15), (60, 4, 0.15), (90, 4.5, 0.15)]
     box_map = make_box_map(centers, halves, [(0, 0, 0), (0, 90, 0), (0, 3, 0)], roads)
     assert layers_of(box_map).tolist() == [3.0, 3.5, 3.0]
     renderer, seen = opened(renderer_name, box_map), []
@@ -246,10 +249,8 @@ def test_of_coplanar_surfaces_of_one_kind_always_the_same_one_is_seen(renderer_n
 def test_depth_is_exact_far_from_the_world_origin(renderer_name):
     offset = (84_000.0, -447_000.0, 120.0)  # a real city's national grid
     renderer = opened(renderer_name, street(offset))
-    pose, intrinsic = (
-        pose_towards(np.add(VIEWS[0][0], offset), np.add(VIEWS[0][1], offset)),
-        intrinsic_matrix(*SIZE, 60.0),
-    )
+    pose = pose_towards(np.add(VIEWS[0][0], offset), np.add(VIEWS[0][1], offset))
+    intrinsic = intrinsic_matrix(*SIZE, 60.0)
     frame = renderer.render(pose, intrinsic, None)
     depth, _, ids = traced(street(offset), plane_z_m(street(offset)), pose, intrinsic)
     inner = away_from_silhouettes(depth, ids) & (depth < 60.0)
@@ -332,8 +333,7 @@ def test_what_stands_as_far_as_the_sky_is_sky(renderer_name):
 
 def test_the_person_is_drawn_in_the_projected_box(renderer):
     pose, camera = pose_towards((-4.0, -12.0, 6.0), HIP), Camera(*SIZE, intrinsic_matrix(*SIZE, 60.0))
-    walker = PosedPerson(HIP, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
-    frame = renderer.render(pose, camera.intrinsic, walker)
+    frame = renderer.render(pose, camera.intrinsic, WALKER)
     view = view_target(HIP, pose, camera)
     person = frame.ids == PERSON_ID
     assert (frame.kinds[person] == KINDS["Pedestrians"]).all()
@@ -347,7 +347,7 @@ def test_the_person_is_drawn_in_the_projected_box(renderer):
     assert rows.max() - rows.min() > 0.7 * (y1 - y0)
     assert rendered_visibility(frame, HIP, view, pose, camera)[0] > 0.98
     behind = pose_towards((10.0, 40.0, 3.0), HIP)  # a house in between
-    hidden = renderer.render(behind, camera.intrinsic, walker)
+    hidden = renderer.render(behind, camera.intrinsic, WALKER)
     assert rendered_visibility(hidden, HIP, view_target(HIP, behind, camera), behind, camera) == (0.0, 0.0, 1.0)
     assert not (hidden.ids == PERSON_ID).any()
 
@@ -358,7 +358,7 @@ def test_a_person_under_a_tree_is_seen_from_the_side_and_hidden_from_above(rende
         [(-1.5, 0.0, 3.0), (1.5, 0.0, 3.0)], [(2.0, 2.0, 3.0)] * 2, np.zeros((2, 3)), [KINDS["Vegetation"]] * 2
     )
     renderer, camera = opened(renderer_name, trees), Camera(*SIZE, intrinsic_matrix(*SIZE, 40.0))
-    walker = PosedPerson(hip, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
+    walker = replace(WALKER, hip_m=hip)
     seen = {}
     for name, eye in {"side": (0.0, -12.0, 1.2), "above": (0.0, -1.0, 15.0), "through": (-14.0, 0.0, 0.9)}.items():
         pose = pose_towards(eye, hip)
@@ -439,8 +439,7 @@ def test_a_renderer_may_be_dropped_on_another_thread_in_the_midst_of_a_frame(mon
 
 
 def _digest(renderer) -> str:
-    person = PosedPerson(HIP, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
-    frame = renderer.render(pose_towards(VIEWS[0][0], HIP), intrinsic_matrix(*SIZE, 60.0), person)
+    frame = renderer.render(pose_towards(VIEWS[0][0], HIP), intrinsic_matrix(*SIZE, 60.0), WALKER)
     return hashlib.sha256(b"".join(a.tobytes() for a in (frame.rgb, frame.depth, frame.kinds, frame.ids))).hexdigest()
 
 
@@ -468,11 +467,7 @@ def flights(tmp_path_factory):
     @functools.cache
     def drawn(name: str) -> Path:
         opened(name, street()).close()  # skips where it cannot run
-        settings = {
-            "backend": name, "width_px": 320, "height_px": 180, "fovs_deg": [60.0], "town": "Street",
-            "first_timestamp": 1776000000,
-        }  # fmt: skip
-        return run(build(RenderConfig, settings, "test"), *inputs, folder / name, seed=5)
+        return run(build(RenderConfig, {**DRAWN, "backend": name}, "test"), *inputs, folder / name, seed=5)
 
     return drawn
 
@@ -535,9 +530,8 @@ CAR = PosedBystander(other_id(1), PosedCar(HIP + np.array([-5.0, -1.0, -0.15]), 
 
 def test_others_are_drawn_with_ids_of_their_own_inside_their_boxes(renderer):
     pose, camera = pose_towards((-4.0, -14.0, 9.0), HIP), Camera(*SIZE, intrinsic_matrix(*SIZE, 60.0))
-    walker = PosedPerson(HIP, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
-    alone = renderer.render(pose, camera.intrinsic, walker)
-    frame = renderer.render(pose, camera.intrinsic, walker, [BESIDE, CAR])
+    alone = renderer.render(pose, camera.intrinsic, WALKER)
+    frame = renderer.render(pose, camera.intrinsic, WALKER, [BESIDE, CAR])
     np.testing.assert_array_equal(frame.ids == PERSON_ID, alone.ids == PERSON_ID)
     for other, kind, half in ((BESIDE, "Pedestrians", PERSON_HALF_EXTENTS_M), (CAR, "Car", (2.2, 0.9, 0.75))):
         mask = frame.ids == other.instance_id
@@ -558,13 +552,12 @@ def test_others_are_drawn_with_ids_of_their_own_inside_their_boxes(renderer):
 def test_who_stands_before_the_target_hides_it_and_is_told_from_the_map(renderer):
     camera = Camera(*SIZE, intrinsic_matrix(*SIZE, 40.0))
     pose = pose_towards(HIP + np.array([0.0, -12.0, 0.3]), HIP)
-    walker = PosedPerson(HIP, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
     view = view_target(HIP, pose, camera)
     before = PosedBystander(other_id(1), PosedCar(HIP + np.array([0.0, -4.0, -0.15]), 0.0, (2.2, 0.9, 0.75), 0.3))
     ids = np.array([before.instance_id])
     shares = []
     for others in ((), (before,)):
-        frame = renderer.render(pose, camera.intrinsic, walker, others)
+        frame = renderer.render(pose, camera.intrinsic, WALKER, others)
         score, by_others, by_map = rendered_visibility(frame, HIP, view, pose, camera, ids)
         assert score + by_others + by_map == pytest.approx(1.0), "all of the box lies in the image"
         shares.append((score, by_others, by_map))
@@ -573,7 +566,7 @@ def test_who_stands_before_the_target_hides_it_and_is_told_from_the_map(renderer
     assert 0.2 < shares[1][1] < 0.95
     assert shares[1][2] == shares[0][2]
     behind = pose_towards((10.0, 40.0, 3.0), HIP)  # a house in between
-    frame = renderer.render(behind, camera.intrinsic, walker, (before,))
+    frame = renderer.render(behind, camera.intrinsic, WALKER, (before,))
     view = view_target(HIP, behind, camera)
     assert rendered_visibility(frame, HIP, view, behind, camera, ids) == (0.0, 0.0, 1.0)
 
@@ -581,20 +574,11 @@ def test_who_stands_before_the_target_hides_it_and_is_told_from_the_map(renderer
 def test_nobody_else_has_the_ids_of_others(renderer_name):
     boxes = make_box_map([(0.0, 4.0, 1.0)], [(1.0, 1.0, 1.0)], np.zeros((1, 3)), [KINDS["Buildings"]], [MAX_BOX_ID])
     pose, intrinsic = pose_towards((0.0, -10.0, 3.0), (0.0, 2.0, 1.0)), intrinsic_matrix(*SIZE, 60.0)
-    try:
-        renderer = open_renderer(renderer_name, boxes, *SIZE, num_others=2)
-    except EnvironmentMissing as error:
-        pytest.skip(str(error))
-    ids = np.unique(
-        renderer.render(
-            pose, intrinsic, None, [replace(CAR, body=replace(CAR.body, center_m=np.array([4.0, 0.0, 0.75])))]
-        ).ids
-    )
+    renderer = opened(renderer_name, boxes, num_others=2)
+    car = replace(CAR, body=replace(CAR.body, center_m=np.array([4.0, 0.0, 0.75])))
+    ids = np.unique(renderer.render(pose, intrinsic, None, [car]).ids)
     renderer.close()
     assert ids.tolist() == [NO_INSTANCE, 1, other_id(1)]
-
-
-FEW = {"width_px": 320, "height_px": 180, "fovs_deg": [60.0], "town": "Street"}
 
 
 def with_others(folder: Path, num: int, trace: DroneTrace) -> Path:
@@ -611,7 +595,7 @@ def test_a_flight_with_others_tells_of_them_in_every_frame(renderer_name, tmp_pa
     opened(renderer_name, street()).close()
     trace = circling(6)
     inputs, others = write_inputs(tmp_path / "in", [trace]), with_others(tmp_path / "in", 6, trace)
-    cfg = build(RenderConfig, {**FEW, "backend": renderer_name}, "test")
+    cfg = build(RenderConfig, {**DRAWN, "backend": renderer_name}, "test")
     tree = run(cfg, *inputs, tmp_path / "tree", seed=5, others=others)
     for folder in find_tracks(tree):
         flight = playback.read_track(folder)
@@ -619,14 +603,10 @@ def test_a_flight_with_others_tells_of_them_in_every_frame(renderer_name, tmp_pa
             meta, ids = read_meta(flight.frame_folder(i)), read_instance(flight.frame_folder(i))[1]
             assert [other.instance_id for other in meta.others.others] == [MAX_BOX_ID, MAX_BOX_ID - 1]
             assert [other.semantic_id for other in meta.others.others] == [KINDS["Pedestrians"], KINDS["Car"]]
-            assert [other.num_pixels for other in meta.others.others] == [
-                int((ids == other_id(k)).sum()) for k in (0, 1)
-            ]
+            assert [other.num_pixels for other in meta.others.others] == [(ids == other_id(k)).sum() for k in (0, 1)]
             assert meta.target.num_pixels == int((ids == PERSON_ID).sum()) > 0
-            assert (
-                meta.target.visibility + meta.others.target_hidden_by_others + meta.others.target_hidden_by_map
-                == pytest.approx(1.0, abs=1e-5)
-            )
+            hidden = meta.others.target_hidden_by_others + meta.others.target_hidden_by_map
+            assert meta.target.visibility + hidden == pytest.approx(1.0, abs=1e-5)
             is_red = (read_view(flight.frame_folder(i), "segmentation") == PEDESTRIAN_RGB).all(axis=-1)
             assert is_red.sum() == meta.target.num_pixels, "the target alone is red for students"
             assert meta.others.others[1].yaw == pytest.approx(-np.degrees(0.3), abs=1e-3), "the tree's axes are CARLA's"
