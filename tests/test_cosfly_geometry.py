@@ -78,41 +78,36 @@ def test_mirroring_is_its_own_inverse_and_keeps_the_picture():
     assert_allclose(uv_mirrored, [[1280 - uv[0, 0], uv[0, 1]]])
 
 
+CAMERA = np.array([80.0, 80.0, 80.0, 45.0])
+
+
+def surface_at(depth_m: float, kind: str = "Buildings", number: int = 7) -> View:
+    instance = np.zeros((90, 160, 3), np.uint8)
+    instance[:] = (KINDS[kind], number, 0)
+    return View(np.full((90, 160), depth_m, np.float32), instance, np.eye(3), np.zeros(3))
+
+
 @each(
     ("kinds", "is_same"),
     [(("Roads", "Roads"), True), (("Roads", "Sidewalks"), False), (("Buildings", "Buildings"), False)],
 )
 def test_of_two_roads_in_one_plane_either_may_show(kinds, is_same):
-    views = []
-    for number, kind in enumerate(kinds):
-        instance = np.zeros((90, 160, 3), np.uint8)
-        instance[:] = (KINDS[kind], number, 0)
-        views.append(View(np.full((90, 160), 20.0, np.float32), instance, np.eye(3), np.zeros(3)))
-    found = compare_views(*views, np.array([80.0, 80.0, 80.0, 45.0]))
+    found = compare_views(*(surface_at(20.0, kind, number) for number, kind in enumerate(kinds)), CAMERA)
     assert found.agree > 1000
     assert found.same == (found.agree if is_same else 0)
-
-
-CAMERA = np.array([80.0, 80.0, 80.0, 45.0])
-
-
-def building_at(depth_m: float) -> View:
-    instance = np.zeros((90, 160, 3), np.uint8)
-    instance[:] = (KINDS["Buildings"], 7, 0)
-    return View(np.full((90, 160), depth_m, np.float32), instance, np.eye(3), np.zeros(3))
 
 
 def test_what_another_thing_hides_is_not_gone_and_what_comes_nearer_by_itself_is():
     """From behind a corner a wall stands before what was seen; seen from the first place it lies outside or is hidden.
     A wall that comes nearer without a camera that moves is before what the first picture shows."""
-    corner, street = building_at(6.0), building_at(20.0)
+    corner, street = surface_at(6.0), surface_at(20.0)
     corner = View(corner.depth, corner.instance, np.eye(3), np.array([30.0, 0.0, 0.0]))
-    around = compare_views(View(street.depth, street.instance, np.eye(3), np.zeros(3)), corner, CAMERA)
+    around = compare_views(street, corner, CAMERA)
     assert around.seen > 500
     assert around.agree == 0
     assert around.missing_share == 0.0
-    assert compare_views(street, building_at(6.0), CAMERA).missing_share == 1.0
-    assert compare_views(building_at(6.0), street, CAMERA).missing_share == 1.0
+    assert compare_views(street, surface_at(6.0), CAMERA).missing_share == 1.0
+    assert compare_views(surface_at(6.0), street, CAMERA).missing_share == 1.0
 
 
 BUILDINGS, WATER, ROADS = KINDS["Buildings"], KINDS["Water"], KINDS["Roads"]
@@ -233,8 +228,8 @@ def random_boxes(rng, num_boxes, spread_m=60.0, tilt=True):
     return kernels.index_boxes(centers, rng.uniform(0, 8, (num_boxes, 3)), rotation_matrices(angles))
 
 
-def index_of_one(center=(0, 0, 0), half=(1, 2, 3), yaw_deg=0.0):
-    return kernels.index_boxes([center], [half], rotation_matrix(0, np.radians(yaw_deg), 0)[None])
+def index_of_one(half, center=(0, 0, 0)):
+    return kernels.index_boxes([center], [half], np.eye(3)[None])
 
 
 def test_nearest_agrees_with_all_pairs(subtests):
@@ -309,9 +304,9 @@ def test_a_wall_hides_what_it_should():
     assert kernels.visibility(index, [(20.0, 0.0, 20.0), (-9.0, 3.0, 50.0)], [(0.0, 0.0, 0.9)] * 2).tolist() == [0, 0]
 
 
-def curve(num: int, dt_s: float = 0.1) -> DroneTrace:
+def curve(num: int) -> DroneTrace:
     """A flight on a curve, whose heading passes the south."""
-    time_s = np.arange(num) * dt_s
+    time_s = np.arange(num) * 0.1
     positions = np.stack([40 * np.cos(time_s / 4), 40 * np.sin(time_s / 4), 12 + time_s], axis=1)
     yaw_deg = (time_s * 35.0 + 120.0 + 180.0) % 360.0 - 180.0
     rotations = np.stack([-30 - time_s, yaw_deg, np.zeros(num)], axis=1)

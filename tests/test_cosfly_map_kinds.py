@@ -238,13 +238,12 @@ def test_a_wrong_town_is_a_config_error(given, words):
         build(MapsConfig, {"synthetic": given}, "x")
 
 
-def node(name: str, x: float, y: float, yaw: float = 0.0, z: float = 0.0, scale: float = 1.0) -> dict:
+def node(name: str, x: float, y: float, yaw: float = 0.0, z: float = 0.0) -> dict:
     return {
         "id": f"GEN_{name}", "instance_name": name,
         "properties": {
             "location": {"x": x, "y": y, "z": z},
-            "orientation": {"pitch": 0, "yaw": yaw, "roll": 0},
-            "scale": {"x": scale, "y": scale, "z": scale},
+            "orientation": {"pitch": 0, "yaw": yaw, "roll": 0}, "scale": {"x": 1.0, "y": 1.0, "z": 1.0},
         },
     }  # fmt: skip
 
@@ -324,12 +323,8 @@ def city_model() -> dict:
     return model
 
 
-def city_of(tmp_path: Path, model: dict) -> BoxMap:
-    return load(tmp_path, document(model))
-
-
 def test_a_city_model_becomes_boxes_round_the_origin(tmp_path: Path):
-    boxes = city_of(tmp_path, city_model())
+    boxes = load(tmp_path, document(city_model()))
     assert boxes.header.offset_m == {"x": 110.0, "y": 65.0, "z": 2.0}
     house = boxes_of(boxes, "Buildings")
     np.testing.assert_allclose(np.r_[house.mins[0], house.maxs[0]], (-10, -15, 0, 0, -9, 12), atol=1e-6)
@@ -357,7 +352,7 @@ def test_courtyards_stay_open(tmp_path: Path):
         "type": "BuildingPart",
         "geometry": [{"type": "MultiSurface", "lod": "1", "boundaries": [roof, floor]}],
     }
-    boxes = city_of(tmp_path, model)
+    boxes = load(tmp_path, document(model))
     houses = boxes_of(boxes, "Buildings")
     union = united([footprint(houses, k) for k in range(len(houses))])
     court = Point(20 - boxes.header.offset_m["x"], 20 - boxes.header.offset_m["y"])

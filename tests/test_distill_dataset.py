@@ -78,7 +78,6 @@ def test_which_captions_teach_and_how_much():
 def asked(tmp_path_factory):
     from caption.schema import CaptionConfig
     from caption.stage.stage import run as caption_run
-    from cosfly.formats.captions import read_captions
 
     root = tmp_path_factory.mktemp("asked")
     path = caption_run(

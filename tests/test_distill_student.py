@@ -122,8 +122,6 @@ def test_prompt_answer_and_end_are_the_whole_chat(place, processor):
 
 def test_a_template_that_writes_something_else_ends_before_the_first_step(place, tmp_path):
     """One that signs every answer: what is taught would not be what the student's own template writes."""
-    import shutil
-
     folder = shutil.copytree(place / "student", tmp_path / "student")
     path = folder / "chat_template.jinja"
     text = path.read_text()
@@ -142,11 +140,6 @@ def base(tmp_path_factory) -> Path:
     # Any file that servers need.
     shutil.copy(folder / "generation_config.json", folder / "video_preprocessor_config.json")
     return folder
-
-
-@pytest.fixture(scope="module")
-def adapter(base, tmp_path_factory) -> Path:
-    return make_adapter(base, tmp_path_factory.mktemp("adapter") / "adapter")
 
 
 @pytest.mark.parametrize("changes", [{}, {"r": 3, "use_rslora": True}, {"target_modules": ["q_proj", "up_proj"]}])
