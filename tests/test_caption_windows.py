@@ -81,10 +81,10 @@ def spoil_future(root, current: int) -> None:
         np.save(frame / "depth.npy", rng.uniform(1, 50, (h, w)).astype(np.float32))
 
 
-def free_requests(root, out, seed=0) -> list[bytes]:
+def free_requests(root, out) -> list[bytes]:
     cfg = {"limit": 1, "repair": {"hard_conflict": "keep"}}
     with TeacherServer(decision=lambda body: "hover") as server:
-        run(CaptionConfig.model_validate({"teacher": server.url, **cfg}), root, out, seed=seed)
+        run(CaptionConfig.model_validate({"teacher": server.url, **cfg}), root, out)
     return sorted(server.bodies)
 
 

@@ -57,17 +57,17 @@ def test_roi_forms(tmp_path):
     assert [len(p.holes) for p in read_roi(path).rings()] == [1, 0]
 
 
-def a_path(n=4):
-    t = np.arange(n) * 0.5
-    return PedestrianTrajectory(
-        "path_00000", np.array([[0.0, 0], [3, 4]]), t, np.stack([t, t, 0 * t], axis=1), np.ones(n)
-    )
+T_S = np.arange(4) * 0.5
 
 
-def a_trace(n=4):
-    t = np.arange(n) * 0.5
-    m = np.stack([t, t + 1, t + 20], axis=1)
-    return DroneTrace("path_00000", "muco", t, m, m, m, np.ones(n), np.full(n, 5.0), {"a": 1.0}, {"b": 2}, None)
+def a_path():
+    places = np.stack([T_S, T_S, 0 * T_S], axis=1)
+    return PedestrianTrajectory("path_00000", np.array([[0.0, 0], [3, 4]]), T_S, places, np.ones(4))
+
+
+def a_trace():
+    m = np.stack([T_S, T_S + 1, T_S + 20], axis=1)
+    return DroneTrace("path_00000", "muco", T_S, m, m, m, np.ones(4), np.full(4, 5.0), {"a": 1.0}, {"b": 2}, None)
 
 
 def test_path_and_trace_round_trip(tmp_path, subtests):
@@ -88,10 +88,7 @@ def test_path_and_trace_round_trip(tmp_path, subtests):
                     assert getattr(back, name) == value
             for change, words in (
                 (lambda record: record["t"].__setitem__(1, "x"), r"t"),
-                (
-                    lambda record: record["t"].__setitem__(1, record["t"][0]),
-                    r"t: the times do not increase; got 0 s, th",
-                ),
+                (lambda one: one["t"].__setitem__(1, one["t"][0]), r"t: the times do not increase; got 0 s, th"),
                 (lambda record: record.get("target", record)["y"].__setitem__(1, 1e9), r".*y: a place is too far from"),
             ):
                 write(path, [make()], {})

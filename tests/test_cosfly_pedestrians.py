@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -37,17 +36,12 @@ from specimens import change_json
 BUILDINGS, ROADS = KINDS["Buildings"], KINDS["Roads"]
 
 
-def town(size_m: float = 160.0, *, walls: list = (), seed: int = 4):
-    rng = np.random.default_rng(seed)
-    centers = [[size_m / 2, size_m / 2, -0.1], *np.column_stack([rng.uniform(0, size_m, (40, 2)), np.full(40, 3.0)])]
-    extents = [[size_m / 2, size_m / 2, 0.1], *np.column_stack([rng.uniform(1, 5, (40, 2)), np.full(40, 3.0)])]
-    yaws = [0.0, *rng.uniform(0, 360, 40), *[0.0] * len(walls)]
-    centers += [center for center, _ in walls]
-    extents += [half_extents for _, half_extents in walls]
-    rotations = np.column_stack([np.zeros(len(yaws)), yaws, np.zeros(len(yaws))])
-    return make_box_map(
-        centers, extents, rotations, [ROADS] + [BUILDINGS] * (len(yaws) - 1), header=MapHeader(name="Town")
-    )
+def town():
+    rng = np.random.default_rng(4)
+    centers = [[80, 80, -0.1], *np.column_stack([rng.uniform(0, 160, (40, 2)), np.full(40, 3.0)])]
+    extents = [[80, 80, 0.1], *np.column_stack([rng.uniform(1, 5, (40, 2)), np.full(40, 3.0)])]
+    rotations = np.column_stack([np.zeros(41), [0.0, *rng.uniform(0, 360, 40)], np.zeros(41)])
+    return make_box_map(centers, extents, rotations, [ROADS] + [BUILDINGS] * 40, header=MapHeader(name="Town"))
 
 
 def plain(size_m: float, *walls):
@@ -56,18 +50,9 @@ def plain(size_m: float, *walls):
     return make_box_map(centers, extents, np.zeros((len(centers), 3)), [ROADS] + [BUILDINGS] * len(walls))
 
 
-def ground_of(text: str) -> WalkableGround:
-    return ground_in(np.array([[int(mark) for mark in row] for row in text.split()], dtype=np.int32))
-
-
 def ground_in(parts: np.ndarray) -> WalkableGround:
     grid = OccupancyGrid(0.0, 0.0, 1.0, parts == 0)
     return WalkableGround(grid, grid, parts, np.zeros(parts.shape, np.uint8), 0.0, costs_of(1))
-
-
-def write_roi(path: Path, points: list) -> Path:
-    path.write_text(json.dumps({"description": "", "closed": True, "points_world": points}))
-    return path
 
 
 @each("start", [(0, 0), (4, 2), (6, 6)])
@@ -148,7 +133,9 @@ def test_a_walk_keeps_every_promise(number, dt_s):
 
 def test_a_detour_is_given_up_and_counted(monkeypatch):
     # A wall of 90 m with a way round it at one end only: near the other end, 10 m across are 150 m on foot.
-    ground = ground_of("\n".join(["1" * 100] * 5 + ["0" * 95 + "1" * 5] + ["1" * 100] * 5))
+    parts = np.ones((11, 100), dtype=np.int32)
+    parts[5, :95] = 0
+    ground = ground_in(parts)
     cfg = PedestriansConfig(resolution_m=1.0, min_distance_m=4, max_distance_m=11, num_retries=50)
     walks = [make_pedestrian("p", ground, cfg, np.random.default_rng(k)) for k in range(40)]
     monkeypatch.setattr(PedestriansConfig, "max_detour", math.inf)
@@ -168,7 +155,8 @@ def test_a_detour_is_given_up_and_counted(monkeypatch):
 def test_the_stage_writes_paths_report_and_picture(tmp_path):
     write_boxes(tmp_path / "step2_simplified.json", town())
     map_file = tmp_path / "step2_simplified.json"
-    roi = write_roi(tmp_path / "roi.json", [[2, 2], [158, 2], [158, 140], [2, 140]])
+    roi = tmp_path / "roi.json"
+    roi.write_text(json.dumps({"closed": True, "points_world": [[2, 2], [158, 2], [158, 140], [2, 140]]}))
     product = run(PedestriansConfig(num_paths=3), map_file, tmp_path / "out", seed=7, roi=roi)
     paths = read_paths(product)
     assert [p.path_id for p in paths] == ["path_00000", "path_00001", "path_00002"]
@@ -235,26 +223,11 @@ def crossing_town(*more: tuple[str, tuple, tuple]) -> BoxMap:
     )
 
 
-def standing(kind: str, x: float, y: float, heading_rad: float = 0.0, n: int = 2) -> Bystander:
-    return Bystander(kind, np.tile([x, y, 0.0], (n, 1)), np.full(n, heading_rad))
-
-
-def going(kind: str, start, end, n: int = 2) -> Bystander:
-    start, end = np.array([*start, 0.0]), np.array([*end, 0.0])
-    places = start + np.linspace(0.0, 1.0, n)[:, None] * (end - start)
-    return Bystander(kind, places, np.full(n, np.arctan2(*(end - start)[1::-1])))
-
-
 def test_others_round_trip_and_bad_files(tmp_path):
     path = tmp_path / "others.json"
-    write_bystanders(
-        path,
-        [
-            Bystanders("p", [going(CAR, (0, 0), (4, 3)), replace(standing(PERSON, 1, 1), is_look_alike=True)]),
-            Bystanders("q", []),
-        ],
-        {"map": "T"},
-    )
+    car = Bystander(CAR, np.array([[0.0, 0.0, 0.0], [4.0, 3.0, 0.0]]), np.full(2, np.arctan2(3, 4)))
+    person = Bystander(PERSON, np.tile([1.0, 1.0, 0.0], (2, 1)), np.zeros(2), is_look_alike=True)
+    write_bystanders(path, [Bystanders("p", [car, person]), Bystanders("q", [])], {"map": "T"})
     first, second = read_bystanders(path)
     assert (first.path_id, second.path_id, second.others) == ("p", "q", [])
     assert [other.kind for other in first.others] == [CAR, PERSON]
@@ -407,23 +380,16 @@ def test_points_are_counted_by_where_they_are(way, marked, counts):
     assert count_on_road(walk, ground.footing, ground.grid) == counts
 
 
-def shares(cfg: RunConfig, name: str, num_others: int = 0) -> tuple[float, float]:
-    """Shares of the walked points of a town, on carriageway away from crossings and on crossings; the others' too."""
+def shares(cfg: RunConfig, name: str) -> tuple[float, float]:
+    """Shares of the walked points of a town, on carriageway away from crossings and on crossings."""
     town = cfg.of_town(name)
-    walking = town.pedestrians.model_copy(update={"others": num_others})
+    walking = town.pedestrians
     ground = walkable_ground(simplify(load_map(town.maps, seed=town.seed), town.simplify).box_map, walking)
     counts = np.zeros(3)
     for k in range(walking.num_paths):
         rng = rng_for(town.seed, "pedestrians", f"path_{k:05d}")
         walk = make_pedestrian(f"path_{k:05d}", ground, walking, rng).trajectory
-        everybody = [walk.positions_m]
-        if num_others:
-            everybody += [other.positions_m for other in bystanders_of(walk, ground, [], walking, rng).others]
-        for places in everybody:
-            moves = np.r_[True, np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1) > 1e-6]
-            line = walk.polyline_m if places is walk.positions_m else places[moves, :2]
-            one = PedestrianTrajectory("p", line, walk.time_s, places, walk.speeds_mps)
-            counts += *count_on_road(one, ground.footing, ground.grid), len(places)
+        counts += *count_on_road(walk, ground.footing, ground.grid), len(walk.positions_m)
     return counts[0] / counts[2], counts[1] / counts[2]
 
 

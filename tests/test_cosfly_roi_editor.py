@@ -25,13 +25,13 @@ CFG = PedestriansConfig(num_paths=2, min_distance_m=20, max_distance_m=40, min_c
 SQUARE = [[10, 10], [90, 10], [90, 70], [10, 70]]
 
 
-def town(name: str = "plaza", **header: object) -> BoxMap:
+def town() -> BoxMap:
     """A square of 120 m x 80 m with a house, a low wall across half of it, and a bin."""
     rows = [[60, 40, -0.1], [60, 40, 5], [30, 60, 1], [100, 20, 0.5]]
     halves = [[60, 40, 0.1], [8, 6, 5], [14, 0.3, 1], [0.4, 0.4, 0.5]]
     kinds = [KINDS[kind] for kind in ("Ground", "Buildings", "Walls", "Static")]
     turned = [[0, 0, 0], [0, 20, 0], [0, 0, 0], [0, 0, 0]]
-    return make_box_map(rows, halves, turned, kinds, header=MapHeader(name=name, ground_z_m=0.0, **header))
+    return make_box_map(rows, halves, turned, kinds, header=MapHeader(name="plaza", ground_z_m=0.0))
 
 
 @pytest.fixture
@@ -72,10 +72,6 @@ def settled(page: Page) -> None:
     for _ in range(2):  # what was changed while it asked is asked for afterwards
         page.run("new Promise((done) => setTimeout(done, 150))")  # ends after the 100 ms that it waits for more changes
         page.wait("!document.body.dataset.asks")
-
-
-def message(page: Page) -> str:
-    return page.run("document.getElementById('message').textContent")
 
 
 @pytest.mark.slow
