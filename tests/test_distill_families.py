@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -30,14 +31,19 @@ SIZES_PX = ((64, 36), (320, 180), (224, 126), (160, 90))
 
 
 @pytest.fixture
-def llama(built_once) -> Path:
-    return built_once("family_llama", lambda root: make_family("llama", root / "llama")) / "llama"
+def made(built_once) -> Callable[[str], Path]:
+    """Return a function that gives the student of a family."""
+    return lambda name: built_once(f"family_{name}", lambda root: make_family(name, root / name)) / name
+
+
+@pytest.fixture
+def llama(made) -> Path:
+    return made("llama")
 
 
 @pytest.fixture(params=FAMILIES)
-def family(request, built_once) -> Path:
-    name = request.param
-    return built_once(f"family_{name}", lambda root: make_family(name, root / name)) / name
+def family(request, made) -> Path:
+    return made(request.param)
 
 
 def test_the_loss_is_that_of_the_library(place, family):
@@ -74,10 +80,9 @@ def test_prompt_answer_and_end_are_what_the_template_writes(place, family):
 
 
 @each("name", WITH_PICTURES)
-def test_a_picture_takes_the_tokens_that_the_family_s_processor_says(name, place, built_once):
+def test_a_picture_takes_the_tokens_that_the_family_s_processor_says(name, place, made):
     """Training writes the prompt that a server makes of the picture that it is sent; its features are as many."""
-    folder = built_once(f"family_{name}", lambda root: make_family(name, root / name)) / name
-    own, sample = load_student(folder, device="cpu"), samples_of(place)[0]
+    own, sample = load_student(made(name), device="cpu"), samples_of(place)[0]
     token = getattr(own.core.config, "image_token_id", None) or own.core.config.image_token_index
     width = own.core.config.get_text_config().hidden_size
     for size_px, max_pixels, frames in product(SIZES_PX, (0, 40 * 40), (5, 1)):
@@ -144,13 +149,11 @@ def _without_end(folder: Path) -> None:
     change_json(folder / "tokenizer_config.json", lambda value: value.pop("eos_token"))
 
 
-def _remote_code(folder: Path) -> None:
-    own = {"auto_map": {"AutoConfig": "code.Config"}, "model_type": "their_own"}
-    change_json(folder / "config.json", lambda value: value.update(own))
+def _configured(**values: Any) -> Callable[[Path], None]:
+    return lambda folder: change_json(folder / "config.json", lambda config: config.update(values))
 
 
-def _unknown_family(folder: Path) -> None:
-    change_json(folder / "config.json", lambda value: value.update(model_type="qwen99"))
+THEIR_OWN = {"auto_map": {"AutoConfig": "code.Config"}, "model_type": "their_own"}
 
 
 def _missing_weights(folder: Path) -> None:
@@ -159,17 +162,13 @@ def _missing_weights(folder: Path) -> None:
     safetensors.save_file(weights, folder / "model.safetensors", {"format": "pt"})
 
 
-def _no_language_model(folder: Path) -> None:
-    change_json(folder / "config.json", lambda value: value.update(model_type="vit"))
-
-
 @each("change, words", [
     (_without_template, r"no chat template.*set distill\.train\.chat_template"),
     (_without_end, r"no end token.*eos_token"),
-    (_remote_code, r"a model with its own code.*allow_code=true"),
-    (_unknown_family, r"qwen99.*update transformers"),
+    (_configured(**THEIR_OWN), r"a model with its own code.*allow_code=true"),
+    (_configured(model_type="qwen99"), r"qwen99.*update transformers"),
     (_missing_weights, r"no weights for some of its layers.*o_proj.*download the whole model"),
-    (_no_language_model, r"cannot be loaded.*ViTConfig.*use another student"),
+    (_configured(model_type="vit"), r"cannot be loaded.*ViTConfig.*use another student"),
 ])  # fmt: skip
 def test_a_student_that_cannot_be_used_is_refused_in_one_line(place, tmp_path, change, words):
     folder = make_family("llama", tmp_path / "student")
@@ -179,13 +178,12 @@ def test_a_student_that_cannot_be_used_is_refused_in_one_line(place, tmp_path, c
     assert "\n" not in str(told.value)
 
 
-def test_a_family_without_image_features_is_refused(place, built_once, tmp_path, monkeypatch):
+def test_a_family_without_image_features_is_refused(place, made, tmp_path, monkeypatch):
     from transformers import InternVLModel
 
-    folder = built_once("family_internvl", lambda root: make_family("internvl", root / "internvl")) / "internvl"
     monkeypatch.delattr(InternVLModel, "get_image_features")
     with pytest.raises(InputError, match=r"get_image_features to encode pictures.*InternVL.*modalities=\[\]"):
-        run(place, tmp_path / "out", folder, max_steps=1)
+        run(place, tmp_path / "out", made("internvl"), max_steps=1)
 
 
 def test_a_head_that_scales_its_logits_is_refused(place, llama, tmp_path, monkeypatch):
