@@ -1,11 +1,8 @@
 """Fixtures shared by all tests."""
 
-import contextlib
 import os
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -41,32 +38,6 @@ def clean_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     before = signal.getsignal(signal.SIGTERM)
     yield
     signal.signal(signal.SIGTERM, before)
-
-
-HOLDER = """
-import sys, time
-from pathlib import Path
-from cosfly.runtime.run_dir import hold_folder
-lock = hold_folder(Path(sys.argv[1]))
-print("held", flush=True)
-time.sleep(600)
-"""
-
-
-@contextlib.contextmanager
-def _held_by_another(folder: Path) -> Iterator[subprocess.Popen]:
-    with subprocess.Popen([sys.executable, "-c", HOLDER, str(folder)], stdout=subprocess.PIPE, text=True) as other:
-        assert other.stdout.readline() == "held\n"
-        try:
-            yield other
-        finally:
-            other.kill()
-
-
-@pytest.fixture
-def held_by_another() -> Callable[[Path], contextlib.AbstractContextManager[subprocess.Popen]]:
-    """Give a context in which another process holds a folder; it is killed at the end."""
-    return _held_by_another
 
 
 @pytest.fixture
@@ -127,12 +98,6 @@ def two_splits(built_once) -> Path:
     from specimens_release import TWO_SPLITS, make_release
 
     return built_once("two_splits", lambda root: make_release(root, **TWO_SPLITS)) / "release" / "dataset"
-
-
-@pytest.fixture(scope="session")
-def dataset(two_splits) -> Path:
-    """The release of a test that does not mind which."""
-    return two_splits
 
 
 @pytest.fixture(scope="session")

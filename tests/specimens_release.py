@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter, defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
 
@@ -36,6 +37,7 @@ TOWNS = ("Town01", "Town02")
 TWO_SPLITS = {"split_by": "town", "validation_fraction": 0.4, "test_fraction": 0.0}
 FREE = {"licence": "cc-by-4.0", "pairs": "any", "validation_fraction": 0, "test_fraction": 0}
 CFG = ReleaseConfig(num_frames=8, shard_mb=1, row_group_mb=1, credits="Map: a specimen.", **FREE)
+DROPPED = {"status": "dropped", "drop_reason": "hard_conflict"}
 REPAIR = {"strategy": "anchored", "asks": 1, "first_decision": "hover", "first_verdict": "HARD_CONFLICT"}
 
 
@@ -87,7 +89,7 @@ def make_inputs(root: Path) -> Path:
     captions = []
     for flight in map(read_track, find_tracks(tree)):
         captions += [make_caption(flight, index) for index in range(4, NUM_POINTS - 1)]
-        captions.append(make_caption(flight, 11, status="dropped", drop_reason="hard_conflict", en=None, zh=None))
+        captions.append(make_caption(flight, 11, **DROPPED, en=None, zh=None))
     write_captions(root / "captions.jsonl", captions)
     names = [folder.relative_to(tree).as_posix() for folder in find_tracks(tree)]
     gone = {names[1]: ("rejected", "missing_file"), names[4]: ("review", "stray_frame")}
@@ -109,15 +111,22 @@ def make_release(root: Path, num_frames: int = 400, window: int = 5, **change) -
     return release_of(root, window=window, num_frames=num_frames, **change)
 
 
-def release_of(root: Path, window: int = 5, picture_px: tuple[int, int] = (96, 54), **change) -> Path:
+def release_of(
+    root: Path,
+    window: int = 5,
+    picture_px: tuple[int, int] = (96, 54),
+    changes: Callable[[Caption], dict] = lambda caption: {},
+    **settings,
+) -> Path:
+    """Release the tree of a folder with a caption of each whole window; changes: of captions, by their fields."""
     captions = [
         make_caption(flight, i, window=list(range(i - window + 1, i + 1)), picture_px=picture_px)
         for flight in map(read_track, find_tracks(root / "tree"))
         for i in range(4, len(flight) - 1)
     ]
-    write_captions(root / "captions.jsonl", captions)
+    write_captions(root / "captions.jsonl", [one.model_copy(update=changes(one)) for one in captions])
     write_inspection(root / "inspect.json", make_inspection(root / "tree", {}))
-    return build(root, root / "release", CFG.model_copy(update={"num_frames": 400, **change}))
+    return build(root, root / "release", CFG.model_copy(update={"num_frames": 400, **settings}))
 
 
 def rewrite_captions(root: Path, change) -> None:

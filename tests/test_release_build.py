@@ -197,12 +197,8 @@ def other_kind(frame_file: str, kind: str):
 FIFTH = "frames_playback/frame_00005"
 
 
-def captions_of(change):
-    return lambda root: rewrite_captions(root, change)
-
-
 def caption(**values):
-    return captions_of(lambda lines: lines[0].update(values))
+    return lambda root: rewrite_captions(root, lambda lines: lines[0].update(values))
 
 
 def of_no_frame(root: Path) -> None:
@@ -236,9 +232,9 @@ DAMAGES = {
     "a caption of no frame": (of_no_frame, "the frame of the caption does not exist"),
     "a caption of no flight": (caption(trajectory="trajectory_1", sample_id="trajectory_1_ORI_frame_00004"),
         "has no track of this caption"),
-    "an id of another frame": (captions_of(lambda lines: lines[0].update(sample_id=lines[1]["sample_id"])),
+    "an id of another frame": (lambda r: rewrite_captions(r, lambda c: c[0].update(sample_id=c[1]["sample_id"])),
         "does not match its frame"),
-    "two captions of a frame": (captions_of(lambda lines: lines.append(lines[0])), "two accepted captions"),
+    "two captions of a frame": (lambda r: rewrite_captions(r, lambda c: c.append(c[0])), "two accepted captions"),
     "a caption in one language": (caption(zh=None), "no text in one of the two languages"),
     "a frame that is no number": (caption(frame_index="x"), "frame_index"),
     "a picture of 2^64 px": (caption(picture_px=[2**64, 54]), r"picture_px\[0\]: .*got 18446744"),
@@ -257,9 +253,7 @@ def test_material_that_cannot_be_released_is_refused_by_name(copy, tmp_path, dam
 
 
 def test_each_shard_that_cannot_be_written_is_named(copy, tmp_path, monkeypatch):
-    from release.build import config
-
-    monkeypatch.setattr(config, "MB", 20_000)
+    monkeypatch.setattr("release.build.config.MB", 20_000)
     pictures = [folder / FIFTH / "rgb.png" for folder in find_tracks(copy / "tree")[::2]]  # of both trajectories
     for picture in pictures:
         cut(picture, 20)
@@ -271,10 +265,9 @@ def test_each_shard_that_cannot_be_written_is_named(copy, tmp_path, monkeypatch)
 
 def test_after_a_failed_flight_the_finished_shards_are_not_done_again(tmp_path, monkeypatch):
     copy = make_material(tmp_path / "material", 3)
-    from release.build import config
     from release.build import stage as package
 
-    monkeypatch.setattr(config, "MB", 20_000)
+    monkeypatch.setattr("release.build.config.MB", 20_000)
     whole = run(split_cfg(), [source_of(copy)], tmp_path / "whole")
     picture = find_tracks(copy / "tree")[0] / "frames_playback/frame_00005/rgb.png"
     data = picture.read_bytes()
@@ -458,11 +451,11 @@ def test_a_release_without_a_licence_is_refused(release_inputs, tmp_path, licenc
 OTHER_TOWNS = {"Town01": "Town03", "Town02": "Town04"}
 
 
-def other_run(release_inputs: Path, target: Path, rename: dict[str, str] = OTHER_TOWNS) -> Path:
+def other_run(release_inputs: Path, target: Path) -> Path:
     shutil.copytree(release_inputs, target)
-    for old, new in rename.items():
+    for old, new in OTHER_TOWNS.items():
         (target / "tree" / old).rename(target / "tree" / new)
-    rewrite_captions(target, lambda lines: [one.update(town=rename.get(one["town"], one["town"])) for one in lines])
+    rewrite_captions(target, lambda lines: [one.update(town=OTHER_TOWNS[one["town"]]) for one in lines])
     write_inspection(target / "inspect.json", make_inspection(target / "tree", {}))
     return target
 

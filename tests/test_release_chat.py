@@ -9,12 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from specimens_release import CFG, build, make_caption, make_inspection, release_of
+from specimens_release import CFG, DROPPED, build, release_of
 
-from cosfly.formats.captions import Coc, read_captions, write_captions
-from cosfly.formats.inspection import write_inspection
-from cosfly.formats.playback import read_track
-from cosfly.formats.tracks import find_tracks
+from cosfly.formats.captions import Caption, Coc, read_captions
 from cosfly.runtime.config import build as build_config
 from cosfly.runtime.errors import CosflyError, InputError, StorageError
 from cosfly.runtime.png import png_size
@@ -30,33 +27,24 @@ ANSWER = {"critical_components": "=HYPERLINK(1) ahead", "reasoning_trace": 'A, B
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
-    """A run folder: render/, caption/captions.jsonl (one dropped in each flight), and release/dataset/ of it."""
+    """A run folder: render/, captions.jsonl (one dropped in each flight), and release/dataset/ of it."""
     root = tmp_path_factory.mktemp("one") / "run"
     make_playback_tree(root / "render", 2, NUM_POINTS)
     (root / "tree").symlink_to("render")
-    captions = []
-    for number, flight in enumerate(map(read_track, find_tracks(root / "render"))):
-        for i in range(4, NUM_POINTS - 1):
-            caption = make_caption(flight, i)
-            if i == NUM_POINTS - 2:
-                caption = caption.model_copy(update={"status": "dropped", "drop_reason": "hard_conflict"})
-            elif number == 0 and i == 4:
-                decision = caption.en.flight_decision
-                caption = caption.model_copy(update={"en": Coc(**ANSWER | {"flight_decision": decision})})
-            captions.append(caption)
-    (root / "caption").mkdir()
-    write_captions(root / "caption/captions.jsonl", captions)
-    write_captions(root / "captions.jsonl", captions)
-    write_inspection(root / "inspect.json", make_inspection(root / "render", {}))
-    build(root, root / "release", CFG.model_copy(update={"selection": "all"}))
+
+    def changes(caption: Caption) -> dict:
+        odd = Coc(**ANSWER | {"flight_decision": caption.en.flight_decision})
+        return {4: {"en": odd}, NUM_POINTS - 2: DROPPED}.get(caption.frame_index, {})
+
+    release_of(root, changes=changes, selection="all")
     return root
 
 
 def accepted(run: Path) -> list:
-    return [caption for caption in read_captions(run / "caption/captions.jsonl") if caption.status == "accepted"]
+    return [caption for caption in read_captions(run / "captions.jsonl") if caption.status == "accepted"]
 
 
-def chat(source: Path, out: Path, format: str = "chat", **settings) -> Path:
+def exported(source: Path, out: Path, format: str = "chat", **settings) -> Path:
     return export(build_config(ExportConfig, {"format": format, **settings}, "test"), source, out)
 
 
@@ -64,8 +52,8 @@ def chat(source: Path, out: Path, format: str = "chat", **settings) -> Path:
 def test_the_last_frame_alone_needs_no_consecutive_frames(run, tmp_path, format):
     stride = build(run, tmp_path / "r", CFG.model_copy(update={"num_frames": 5}))
     with pytest.raises(InputError, match=r"needs consecutive frames.*release\.selection=windows"):
-        chat(stride, tmp_path / "windows", format)
-    folder = chat(stride, tmp_path / "last", format, frames="last", languages=["en"])
+        exported(stride, tmp_path / "windows", format)
+    folder = exported(stride, tmp_path / "last", format, frames="last", languages=["en"])
     released = read_record(stride / "release.json").history.captions.released
     about = f"- {released} samples, one per window and language. Skipped: none."
     assert about in (folder / "README.md").read_text(encoding="utf-8")
@@ -79,7 +67,7 @@ def lines_of(path: Path) -> list[dict]:
 @pytest.mark.parametrize("shown", ["all", "last"])
 def test_messages_are_what_their_loaders_ask_for(run, tmp_path, shown):
     datasets = pytest.importorskip("datasets")
-    product = chat(run, tmp_path / "out", frames=shown)
+    product = exported(run, tmp_path / "out", frames=shown)
     samples = lines_of(product / "train.jsonl")
     found = datasets.load_dataset(
         "json", data_files=str(product / "train.jsonl"), split="train", cache_dir=str(tmp_path / "cache")
@@ -106,14 +94,14 @@ def test_pictures_have_the_pixels_of_which_the_texts_speak(tmp_path):
     """A caption's numbers refer to the pictures that its teacher saw, which may be smaller than the frames."""
     make_playback_tree(tmp_path / "tree", 1, NUM_POINTS, width_px=96, height_px=54)
     dataset = release_of(tmp_path, picture_px=(32, 18))
-    product = chat(dataset, tmp_path / "out")
+    product = exported(dataset, tmp_path / "out")
     [sample, *_] = lines_of(product / "train.jsonl")
     assert "pictures of 32 x 18 px" in json.dumps(sample)
     assert {png_size((product / name).read_bytes()) for name in sample["images"]} == {(32, 18)}
 
 
 def test_sharegpt_is_one_file_a_split_with_its_entry(two_splits, tmp_path):
-    product = chat(two_splits, tmp_path / "out", "sharegpt", languages=["en"])
+    product = exported(two_splits, tmp_path / "out", "sharegpt", languages=["en"])
     about = json.loads((product / "dataset_info.json").read_text())
     assert set(about) == {"cosfly_train", "cosfly_validation"}
     ids = set()
@@ -138,29 +126,22 @@ def test_a_training_set_is_not_made_of_a_release(run):
 DISK_BYTES = 1_000  # the largest file that the system permits
 
 
-@pytest.fixture(scope="module")
-def whole_release(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("whole")
-    make_playback_tree(root / "tree", 2, 9, width_px=96, height_px=54)
-    return release_of(root)
-
-
 @pytest.mark.parametrize("format", ["chat", "sharegpt"])
 def test_a_release_without_captions_is_refused(tmp_path, format):
     make_playback_tree(tmp_path / "tree", 1, 4, width_px=96, height_px=54)  # too short for a window
     dataset = release_of(tmp_path)
     with pytest.raises(CosflyError, match="no caption to export") as caught:
-        export(build_config(ExportConfig, {"format": format}, "test"), dataset, tmp_path / "out")
+        exported(dataset, tmp_path / "out", format)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out" / format).exists()
 
 
 @pytest.mark.parametrize("format", EXPORTS)
-def test_what_is_not_a_release_is_refused(whole_release, tmp_path, format):
+def test_what_is_not_a_release_is_refused(two_splits, tmp_path, format):
     run = tmp_path / "run"
-    shutil.copytree(whole_release.parents[1] / "tree", run / "render")
+    shutil.copytree(two_splits.parents[1] / "tree", run / "render")
     with pytest.raises(InputError, match=r"the folder is not a release.*cosfly release build") as caught:
-        export(build_config(ExportConfig, {"format": format}, "test"), run, tmp_path / "out")
+        exported(run, tmp_path / "out", format)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
 
@@ -179,11 +160,11 @@ def full_disk() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("format", EXPORTS)
-def test_a_full_disk_leaves_nothing_half_written(whole_release, tmp_path, format):
-    cfg, out = build_config(ExportConfig, {"format": format}, "test"), tmp_path / "out"
+def test_a_full_disk_leaves_nothing_half_written(two_splits, tmp_path, format):
+    out = tmp_path / "out"
     with full_disk(), pytest.raises(StorageError, match="the file cannot be written") as caught:
-        export(cfg, whole_release, out)
+        exported(two_splits, out, format)
     assert "\n" not in str(caught.value)
     assert not (out / format).exists()
     assert list(out.rglob("*.partial")) == []
-    assert (export(cfg, whole_release, out) / "README.md").is_file()
+    assert (exported(two_splits, out, format) / "README.md").is_file()
