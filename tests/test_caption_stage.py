@@ -248,16 +248,12 @@ def test_a_comparison_by_hand():
 
 @each(("text", "verdict"), [
     ('{"verdict": "FIX_LABEL", "reason": "the text argues for the label"}', "FIX_LABEL"),
-    ('```json\n{"verdict": "REJECT_REGEN", "reason": "wrong"}\n```', "REJECT_REGEN"),
     ("ACCEPT_ALTERNATIVE", UNJUDGED),
-    ("", UNJUDGED),
     ('{"verdict": "ACCEPT", "reason": "fine"}', UNJUDGED),
     ('{"verdict": "ACCEPT_ALTERNATIVE"}', UNJUDGED),
     ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": " "}', UNJUDGED),
     ('{"verdict": ["ACCEPT_ALTERNATIVE"], "reason": "x"}', UNJUDGED),
     ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": "x"} {"verdict": "REJECT_REGEN", "reason": "y"}', "REJECT_REGEN"),
-    ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": ', UNJUDGED),
-    ('["ACCEPT_ALTERNATIVE"]', UNJUDGED),
 ])  # fmt: skip
 def test_reading_a_judgement(text, verdict):
     assert parse_judgement(text)[0] == verdict

@@ -306,14 +306,11 @@ def test_a_server_that_refuses_every_window_ends_the_run_and_retry_failed_asks_a
 # What a server says to some windows while it answers the others: status, words, and the reason they are dropped for.
 WINDOW_FAULTS = {
     "too long": (400, TOO_LONG, "refused_too_long"),
-    "too long, llama.cpp": (500, "Context size has been exceeded.", "refused_too_long"),
     "too long, LM Studio": (200, "Trying to keep the first 9136 tokens when context the overflows. However, the model "
         "is loaded with context length of only 4096 tokens.", "refused_too_long"),
     "filtered": (400, FILTERED, "refused_content"),
-    "flagged": (403, "Your chosen model requires moderation and your input was flagged.", "refused_content"),
     "filtered, with the request": (400, "The request was blocked: response_format=json_schema, messages=...",
         "refused_schema"),
-    "a picture": (400, "cannot identify image file <_io.BytesIO object at 0x7f2a>", "refused_400"),
     "words that nobody knows": (400, NOT_KNOWN, "refused_400"),
     "markup and escapes": (400, '[bold]\x1b[31m<script>alert("x")</script>\nnext\x00line[/] %s {0}', "refused_400"),
 }  # fmt: skip

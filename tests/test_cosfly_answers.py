@@ -208,9 +208,7 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
         "As ```json {}``` shows, nothing has to change."),
     ("any model: prose round it", f"Sure! Here it is:\n{TEXT}\nI hope this helps.", (PROSE,)),
     ("any model: braces in the prose", f"The set {{left, right}} and {{}} {TEXT} as in {{t0..t4}}.", (PROSE,)),
-    ("any model: a score after it", f'{TEXT}\n{{"confidence": 0.9}}', (PROSE,)),
     ("any model: two drafts, the last counts", f"{DRAFT}\n{TEXT}", (PROSE,)),
-    ("any model: a draft that breaks off", f"{HALF}\nLet me start again.\n{TEXT}", (PROSE,)),
     ("templates of Python: doubled braces", f"{{{TEXT}}}", (PROSE,)),
     ("vLLM, Qwen3 with thinking off: a brace too many", f"{{\n{TEXT}", (PROSE,)),
     # wrapped

@@ -51,11 +51,7 @@ def foreign(tmp_path_factory) -> Path:
 
 
 def copied(tree: Path, target: Path) -> Path:
-    for file in sorted(path for path in tree.rglob("*") if path.is_file()):
-        place = target / file.relative_to(tree)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        os.link(file, place)
-    return target
+    return shutil.copytree(tree, target, copy_function=os.link)
 
 
 def first_waypoint(change: Callable[[dict], object]) -> Callable[[dict], object]:

@@ -291,23 +291,14 @@ def test_what_is_not_flown_is_counted_and_stays_in_every_table(made):
     assert [len(table.rows) for table in tables] == [5, 5, 5, 5, 4, 4, 4]
     manifest = json.loads((made / "manifest.json").read_text())
     assert manifest["counts"]["kept"] == 2
-
-
-@pytest.mark.slow
-def test_the_tables_are_those_of_the_flights(made):
-    found, records = json.loads((made / "compare.json").read_text()), Journal(made / "items.jsonl").read_as(read_item)
-    flown = {record.id: result_of(record, PlannedItem) for record in records}
-    assert [set(one.traces) | set(one.errors) for one in flown.values()] == [set(FEW)] * 2
-    traces = [one.read_traces(walk_id) for walk_id, one in flown.items()]
-    for planner in ("track_astar", "muco", "theta_star"):
-        seen = np.mean([flown[planner].visibility.mean() for flown in traces])
-        assert found["means"][planner]["five_ray_mean"] == pytest.approx(seen, abs=1e-4)
-    change = found["means"]["foresight"]["length_m"] - found["means"]["muco"]["length_m"]
+    means, pair = found["means"], found["groups"]["target-aware"]
+    change = means["foresight"]["length_m"] - means["muco"]["length_m"]
     assert found["deltas"]["muco"]["length_m"]["delta"] == pytest.approx(change, abs=1e-3)
-    pair = found["groups"]["target-aware"]
-    assert pair["num_planners"] == 2
-    mean = (found["means"]["track_astar"]["five_ray_mean"] + found["means"]["muco"]["five_ray_mean"]) / 2
-    assert pair["figures"]["five_ray_mean"] == pytest.approx(mean, abs=1e-4)
+    mean = (means["track_astar"]["five_ray_mean"] + means["muco"]["five_ray_mean"]) / 2
+    assert (pair["num_planners"], pair["figures"]["five_ray_mean"]) == (2, pytest.approx(mean, abs=1e-4))
+    records = Journal(made / "items.jsonl").read_as(read_item)
+    flown = [result_of(record, PlannedItem) for record in records]
+    assert [set(one.traces) | set(one.errors) for one in flown] == [set(FEW)] * 2
 
 
 def test_without_ompl_the_error_names_the_extra_and_the_planners_to_leave_out(inputs, tmp_path, monkeypatch):
