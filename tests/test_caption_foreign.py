@@ -11,6 +11,8 @@ from specimens_captions import VOCABULARY
 from specimens_distill import prepared
 from tables import each
 from teacher_server import MODEL, TeacherServer
+from test_cosfly_answers import CHINESE as ZH
+from test_cosfly_answers import GOOD as EN
 
 from caption.schema import CaptionConfig
 from caption.stage.stage import run
@@ -29,15 +31,6 @@ from release.build.sources import Source
 from release.record import read_record
 from release.verify.verify import verify
 from specimens import make_playback_tree
-
-EN = {
-    "critical_components": "The person can be made out on the road in front of the drone.",
-    "reasoning_trace": "Nothing stands in the way, and this manoeuvre is as good as any other here.",
-}
-ZH = {
-    "critical_components": "可以在无人机前方的道路上辨认出这个人。",
-    "reasoning_trace": "没有任何东西挡路，这个动作在这里不比别的差。",
-}
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from specimens_captions import VOCABULARY
 from specimens_distill import WINDOW, make_caption
 from tables import each
 from test_cosfly_render import needs_gl
-from test_renderers_contract import circling, street, write_inputs
+from test_renderers_contract import DRAWN, circling, street, write_inputs
 
 from caption.schema import CaptionConfig, ImageConfig, Window, WindowConfig
 from caption.stage.window_loop import caption_window
@@ -76,12 +76,8 @@ def run_folder(tmp_path_factory) -> Path:
     (folder / "caption").mkdir()
     write_captions(folder / "caption/captions.jsonl", captions)
     (folder / "simplify").mkdir()
-    town = make_box_map(
-        [[0, 0, 5], [4, 9, 1], [900, 0, 5]],
-        [[5, 5, 5], [2, 1, 1], [5, 5, 5]],
-        np.zeros((3, 3)),
-        [KINDS["Buildings"], KINDS["Vegetation"], 3],
-    )
+    centers, halves = [[0, 0, 5], [4, 9, 1], [900, 0, 5]], [[5, 5, 5], [2, 1, 1], [5, 5, 5]]
+    town = make_box_map(centers, halves, np.zeros((3, 3)), [KINDS["Buildings"], KINDS["Vegetation"], 3])
     write_boxes(folder / "simplify/step2_simplified.json", town)
     return folder
 
@@ -282,17 +278,11 @@ def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, 
             assert np.array_equal(picture, wanted)
 
 
-SETTINGS = {
-    "width_px": 320, "height_px": 180, "fovs_deg": [60.0], "town": "Street", "tracks": ["clean"],
-    "first_timestamp": 1776000000,
-}  # fmt: skip
-
-
 @pytest.fixture(scope="module")
 def street_tree(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("overlay")
     inputs = write_inputs(folder / "inputs", [circling(3)])
-    return render(RenderConfig.model_validate(SETTINGS), *inputs, folder / "render")
+    return render(RenderConfig.model_validate({**DRAWN, "tracks": ["clean"]}), *inputs, folder / "render")
 
 
 @needs_gl

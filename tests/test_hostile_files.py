@@ -27,7 +27,9 @@ from pydantic import BaseModel, ValidationError
 from rich.table import Table
 from specimens_release import build, make_inputs
 from test_cosfly_answers import TEXT
+from test_cosfly_boxfile import PLAIN, collection, houses
 from test_cosfly_inspection import plan_of
+from test_cosfly_map_kinds import city, node, write_world
 
 from caption.schema import CaptionConfig
 from caption.stage.ledger import page_html
@@ -74,23 +76,6 @@ class Reader(NamedTuple):
 
 FLIGHT = "tree/Town01/*/ORI"
 FRAME = f"{FLIGHT}/frames_playback/frame_00003"
-RING = [[-30, -8], [30, -8], [30, 8], [-30, 8], [-30, -8]]
-HOUSE = {
-    "type": "Feature", "properties": {"type": "Buildings", "height_m": 9, "yaw_deg": 0},
-    "geometry": {"type": "Polygon", "coordinates": [RING]},
-}  # fmt: skip
-CITY = {
-    "type": "CityJSON", "version": "2.0",
-    "metadata": {"referenceSystem": "https://www.opengis.net/def/crs/EPSG/0/7415"},
-    "transform": {"scale": [0.001] * 3, "translate": [1000.0, 0.0, 0.0]},
-    "vertices": [[x, y, z] for z in (2000, 14_000) for x, y in ((0, 0), (9000, 0), (9000, 8000), (0, 8000))],
-    "CityObjects": {"house": {"type": "Building", "geometry": [{"type": "Solid", "lod": "1.2", "boundaries": [
-        [[[3, 2, 1, 0]], [[4, 5, 6, 7]], [[0, 1, 5, 4]], [[1, 2, 6, 5]], [[2, 3, 7, 6]], [[3, 0, 4, 7]]]]}]}},
-}  # fmt: skip
-WORLD = {"base_map": "x", "nodes": [{
-    "id": "a", "instance_name": "BP_Tree1_C", "properties": {"location": {"x": 100, "y": 200, "z": 0},
-        "orientation": {"pitch": 0, "yaw": 0, "roll": 0}, "scale": {"x": 1, "y": 1, "z": 1}},
-}]}  # fmt: skip
 READERS = {
     "boxes": Reader("boxes_3d.json", read_boxes),
     "region": Reader("roi_polygon.json", read_roi),
@@ -124,12 +109,12 @@ def specimens(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ))  # fmt: skip
     for name, value in (
         ("roi_polygon.json", {"points_world": [[0, 0], [9, 0], [9, 9]], "holes": [[[1, 1], [2, 1], [2, 2]]]}),
-        ("city.json", CITY), ("world.json", WORLD),
-        ("own.geojson", {"type": "FeatureCollection", "features": [HOUSE]}),
+        ("city.json", city()),
     ):  # fmt: skip
         write_json(root / name, value)
-    write_json(root / "Bbox.json", {"all": {"BP_Tree1_C": {"bbox": {"x": 800, "y": 600, "z": 1200}}}})
-    (root / "own.csv").write_text("id,type,x_m,y_m,z_m,length_m,width_m,height_m,yaw_deg\n1,Buildings,0,0,4,9,9,8,30\n")
+    write_world(root, node("BP_Tree1_C", 100, 200))
+    (root / "own.geojson").write_text(collection(*houses(yaw_deg=0)))
+    (root / "own.csv").write_text(PLAIN)
     (root / "answer.txt").write_text(f"<think>hm</think>\n```json\n{TEXT}\n```")
     return root
 
