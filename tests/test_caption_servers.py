@@ -350,16 +350,9 @@ def test_the_key_does_not_follow_a_redirect(tree, tmp_path, monkeypatch):
 TOKENS_PER_IMAGE, CONTEXT = 220, 8192
 
 
-def images_of(body: dict) -> int:
-    contents = [message["content"] for message in body["messages"]]
-    return sum(part["type"] == "image_url" for content in contents if isinstance(content, list) for part in content)
-
-
-def prompt_tokens(body: dict, seen_images: int) -> int:
-    contents = [message["content"] for message in body["messages"]]
-    texts = [part.get("text", "") for content in contents if isinstance(content, list) for part in content]
-    texts += [content for content in contents if isinstance(content, str)]
-    return sum(len(text.split()) for text in texts) + TOKENS_PER_IMAGE * seen_images
+def parts_of(body: dict) -> list[dict]:
+    contents = (message["content"] for message in body["messages"])
+    return [part for one in contents for part in ([{"text": one}] if isinstance(one, str) else one)]
 
 
 # A sound endpoint. cuts: prompts to so many tokens, in silence. shortens: the answer to fit the context, in silence. status: of a refusal for too many pictures.
@@ -376,14 +369,16 @@ def patient(**defects: Any) -> Callable[[dict], tuple[int, dict]]:
     own = SimpleNamespace(**SOUND | defects)
 
     def respond(body: dict) -> tuple[int, dict]:
-        num_images = images_of(body)
+        parts = parts_of(body)
+        num_images = sum(part.get("type") == "image_url" for part in parts)
         if None in body.values() and not own.takes_null:
             return refusal(400, "Input should be a valid number")
         if body["messages"][0]["role"] == "system" and not own.has_system:
             return refusal(400, "System role not supported")
         if len(json.dumps(body)) > own.most_bytes:
             return refusal(413, "Request Entity Too Large")
-        tokens = min(prompt_tokens(body, min(num_images, own.sees_images)), own.cuts)
+        num_words = sum(len(part.get("text", "").split()) for part in parts)
+        tokens = min(num_words + TOKENS_PER_IMAGE * min(num_images, own.sees_images), own.cuts)
         if num_images > own.max_images:
             return refusal(own.status, f"At most {own.max_images} image(s) may be provided in one prompt.")
         if tokens + (0 if own.shortens else body["max_tokens"]) > own.context:

@@ -26,10 +26,6 @@ id,type,x_m,y_m,z_m,length_m,width_m,height_m,yaw_deg
 """
 
 
-def town() -> BoxMap:
-    return invent(SyntheticConfig(size_m=120.0, num_blocks=1), 0)
-
-
 def loaded(tmp_path: Path, text: str, suffix: str = ".csv", **settings: object) -> BoxMap:
     path = tmp_path / f"own{suffix}"
     path.write_text(text, encoding="utf-8")
@@ -270,9 +266,10 @@ def test_what_an_outline_asks_for_is_bounded_before_it_is_made(tmp_path):
 
 
 def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
-    write_boxes(tmp_path / "own.json", town())
+    town = invent(SyntheticConfig(size_m=120.0, num_blocks=1), 0)
+    write_boxes(tmp_path / "own.json", town)
     box_map = load(BoxesConfig(path=tmp_path / "own.json", name="Mine", licence="mit"))
-    assert (box_map.name, box_map.header.licence, len(box_map)) == ("Mine", "mit", len(town()))
+    assert (box_map.name, box_map.header.licence, len(box_map)) == ("Mine", "mit", len(town))
     with pytest.raises(ConfigError, match="its own types, units and ground height"):
         load(BoxesConfig(path=tmp_path / "own.json", ignore=["*"]))
     text = (tmp_path / "own.json").read_text()

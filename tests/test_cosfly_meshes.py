@@ -315,14 +315,10 @@ def scene_map(folder: Path) -> BoxMap:
     return replace(box_map, meshes=Meshes(refs, folder))
 
 
-def rays_of(pose: np.ndarray) -> np.ndarray:
-    v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]] + 0.5
-    return np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.linalg.inv(INTRINSIC).T @ pose[:3, :3].T
-
-
 def traced(triangles: np.ndarray, owners: np.ndarray, pose: np.ndarray):
     """Every pixel's ray against every triangle, by trimesh's geometry: z-depth and owner."""
-    rays = rays_of(pose)
+    v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]] + 0.5
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.linalg.inv(INTRINSIC).T @ pose[:3, :3].T
     depth, ids = np.full(len(rays), np.inf), np.full(len(rays), NO_INSTANCE)
     normals, is_valid = trimesh.triangles.normals(triangles)
     assert is_valid.all()

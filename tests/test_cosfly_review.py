@@ -113,11 +113,7 @@ def flight_of(walked_m, **changes):
     return replace(flight, targets_m=targets, positions_m=positions, perturbation=still, is_original=True, **changes)
 
 
-def straight(steps_m):
-    return np.column_stack([np.cumsum(steps_m), np.zeros(len(steps_m))])
-
-
-EVEN = straight(np.full(NUM, 0.6))
+EVEN = np.column_stack([0.6 * np.arange(1, NUM + 1), np.zeros(NUM)])
 
 
 @given(st.integers(0, 2**31))

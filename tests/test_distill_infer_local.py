@@ -59,10 +59,6 @@ def samples_of(place: Path) -> list[Sample]:
     return list(open_split(place / "set", "train"))
 
 
-def counts_of(out: Path) -> dict:
-    return json.loads((out / "manifest.json").read_text())["counts"]
-
-
 def told(predictions: list[Prediction]) -> dict[str, str]:
     return {prediction.key: prediction.raw for prediction in predictions}
 
@@ -110,7 +106,8 @@ def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
     assert 0 < len(hit) < len(samples) / 2
     others = {key: raw for key, raw in expected.items() if key not in hit}
     assert {p.key: p.raw for p in found if p.key not in hit} == others
-    assert counts_of(tmp_path / "out")["failed"] == {"input": len(hit)}
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert manifest["counts"]["failed"] == {"input": len(hit)}
     assert (tmp_path / "out" / "failures.jsonl").read_text().count("image cannot be decoded") == len(hit)
     (tree / bad).write_bytes(whole)  # mended: those alone are answered
     result = invoke(words)

@@ -16,6 +16,7 @@ from test_docs_run import small_run
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
 NOTEBOOK = json.loads((ROOT / "docs/release.ipynb").read_text(encoding="utf-8"))
+CELLS = [cell for cell in NOTEBOOK["cells"] if cell["cell_type"] == "code"]
 NAME = re.compile(r"^# (\S+\.(?:py|md))$")
 PRODUCTS = (
     "work/blocks/boxes_3d.json", "work/overhead/drone_trace.json", "work/compared/compare.json",
@@ -93,14 +94,9 @@ def test_the_examples_work(clone):
     assert [name for name in PRODUCTS if not (clone / name).is_file()] == []
 
 
-def cells() -> list[str]:
-    return ["".join(cell["source"]) for cell in NOTEBOOK["cells"] if cell["cell_type"] == "code"]
-
-
 def test_every_cell_of_the_notebook_was_run_without_an_error():
-    code = [cell for cell in NOTEBOOK["cells"] if cell["cell_type"] == "code"]
-    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
-    outputs = [output for cell in code for output in cell["outputs"]]
+    assert [cell["execution_count"] for cell in CELLS] == list(range(1, len(CELLS) + 1))
+    outputs = [output for cell in CELLS for output in cell["outputs"]]
     assert not [output for output in outputs if output["output_type"] == "error"]
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
 
@@ -109,7 +105,7 @@ def test_every_cell_of_the_notebook_was_run_without_an_error():
 @pytest.mark.timeout(1800)
 def test_the_cells_of_the_notebook_run(tmp_path):
     write_quickstart(tmp_path)
-    program = "\n\n".join(["import matplotlib", 'matplotlib.use("Agg")', *cells()])
+    program = "\n\n".join(["import matplotlib", 'matplotlib.use("Agg")', *("".join(cell["source"]) for cell in CELLS)])
     for words in (["-m", "cosfly", "run", "quickstart", "--out", "runs/quickstart"], ["-c", program]):
         done = subprocess.run([sys.executable, *words], cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr[-3000:]

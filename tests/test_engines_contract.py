@@ -216,11 +216,6 @@ def model(tmp_path):
     return folder
 
 
-def output(text: str, num_prompt: int = 1280, finish_reason: str = "stop") -> SimpleNamespace:
-    completion = SimpleNamespace(text=text, token_ids=tuple(range(7)), finish_reason=finish_reason)
-    return SimpleNamespace(outputs=[completion], prompt_token_ids=list(range(num_prompt)))
-
-
 class Recorded:
     def __init__(self, **values) -> None:
         self.values = values
@@ -270,8 +265,9 @@ def stand_in(monkeypatch):
             answer = CHINESE if is_chinese else ENGLISH
             decision = schema["properties"]["flight_decision"]["enum"][0]
             decisions = {name: decision for name in schema["properties"] if name not in answer}
-            found = output(json.dumps({**answer, **decisions}), finish_reason=Engine.finish_reason)
-            found.request_id, found.finished = name, True
+            text, tokens = json.dumps({**answer, **decisions}), tuple(range(7))
+            completion = SimpleNamespace(text=text, token_ids=tokens, finish_reason=Engine.finish_reason)
+            found = SimpleNamespace(outputs=[completion], prompt_token_ids=[0] * 1280, request_id=name, finished=True)
             self.open.append(found)
             return [f"{name}-89abcdef"]
 

@@ -212,20 +212,16 @@ def double_depth() -> bytes:
 
 
 def picture(column: str, data: bytes):
-    return (
-        put(at(everything, 2), depth=data)
-        if column == "depth"
-        else change(at(everything, 2), lambda r: r[column].update(bytes=data))
-    )
+    if column == "depth":
+        return put(at(everything, 2), depth=data)
+    return change(at(everything, 2), lambda r: r[column].update(bytes=data))
 
 
 KEPT = {"sample_id", "run", "town", "trajectory", "variant", "frame_index", "image", "instance", "depth", "split",
     "walk", "pair",
         "width_px", "height_px", "track", "time_s", "fov_deg", "pose", "has_caption"}  # fmt: skip
-FEW_PIXELS, MASK = (
-    zlib.compress(b"\0" * 1000),
-    instance_bytes(np.zeros((90, 160), np.uint8), np.zeros((90, 160), np.uint16)),
-)
+FEW_PIXELS = zlib.compress(b"\0" * 1000)
+MASK = instance_bytes(np.zeros((90, 160), np.uint8), np.zeros((90, 160), np.uint16))
 ODD_ROWS = {
     "a PNG of 60,000 x 60,000": picture("image", png_around(FEW_PIXELS, 60_000, 60_000)),
     "an instance of 60,000 x 60,000": picture("instance", png_around(FEW_PIXELS, 60_000, 60_000)),
