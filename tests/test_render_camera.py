@@ -44,11 +44,6 @@ SMALL = {"width_px": 160, "height_px": 90, "town": "Street", "first_timestamp": 
 DYNAMIC = {"mode": "dynamic", "part_s": 2.0, "ramp_s": 1.0}
 
 
-def zoomed(num_frames: int, **settings: float) -> np.ndarray:
-    zoom = ZoomConfig.model_validate({"mode": "dynamic", **settings})
-    return zoomed_deg(110.0, LEVELS, zoom, np.arange(num_frames) * 0.5, (), np.random.default_rng(0))
-
-
 def test_a_field_of_view_outside_0_to_180_is_an_error_and_any_inside_is_taken():
     for fov in (0.0, -30.0, 180.0, 200.0, float("nan")):
         with pytest.raises(ConfigError, match=r"fovs_deg"):
@@ -58,7 +53,8 @@ def test_a_field_of_view_outside_0_to_180_is_an_error_and_any_inside_is_taken():
 
 
 def test_a_flight_goes_from_level_to_level():
-    fovs = zoomed(60, part_s=10.0, ramp_s=2.0)
+    zoom = ZoomConfig(mode="dynamic", part_s=10.0, ramp_s=2.0)
+    fovs = zoomed_deg(110.0, LEVELS, zoom, np.arange(60) * 0.5, (), np.random.default_rng(0))
     assert np.allclose(fovs[:21], 110.0)
     for begin in (24, 44):
         held = fovs[begin : begin + 16]
