@@ -49,6 +49,7 @@ TEXT = {
     "num_key_value_heads": 2, "head_dim": 8, "max_position_embeddings": 4096, "tie_word_embeddings": True,
 }  # fmt: skip
 SIGLIP = {"hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2}
+SIGLIP_32 = {**SIGLIP, "image_size": 32, "patch_size": 8}
 
 
 def make_tokenizer(special: list[str], template: str, eos: str, **named: str) -> Any:
@@ -92,13 +93,8 @@ def _qwen(kind: str) -> tuple[Any, Any, Any, dict[str, Any]]:
         rope |= {"partial_rotary_factor": 1.0, "mrope_interleaved": True}
         text |= {**linear, "linear_key_head_dim": 8, "linear_value_head_dim": 8, "num_hidden_layers": 4}
         text["layer_types"] = (["linear_attention"] * 3) + ["full_attention"]
-    vision: dict[str, Any] = {
-        "depth": 2,
-        "hidden_size": 32,
-        "intermediate_size": 48,
-        "num_heads": 2,
-        "out_hidden_size": 32,
-    }
+    widths = {"hidden_size": 32, "intermediate_size": 48, "out_hidden_size": 32}
+    vision: dict[str, Any] = {**widths, "depth": 2, "num_heads": 2}
     vision |= {"patch_size": 14} if is_old else {"num_position_embeddings": 16}
     if kind == "Qwen3_VL":
         vision["deepstack_visual_indexes"] = [0]
@@ -122,11 +118,10 @@ def _smolvlm() -> tuple[Any, Any, Any, dict[str, Any]]:
     named = {"image_token": "<image>", "global_image_token": "<global-img>"}
     named |= {"fake_image_token": "<fake_token_around_image>", "end_of_utterance_token": "<end_of_utterance>"}
     tokenizer = make_tokenizer([*special, "<global-img>", *rows], SMOLVLM, "<end_of_utterance>", **named)
-    vision = {**SIGLIP, "image_size": 32, "patch_size": 8}
     text = _text(tokenizer) | {"model_type": "llama"}
     image_token = tokenizer.convert_tokens_to_ids("<image>")
     config = SmolVLMConfig(
-        text_config=text, vision_config=vision, scale_factor=2, image_token_id=image_token, tie_word_embeddings=True,
+        text_config=text, vision_config=SIGLIP_32, scale_factor=2, image_token_id=image_token, tie_word_embeddings=True,
         pad_token_id=tokenizer.pad_token_id,
     )  # fmt: skip
     edges: Any = {"size": {"longest_edge": 64}, "max_image_size": {"longest_edge": 32}}
@@ -145,8 +140,7 @@ def _gemma3() -> tuple[Any, Any, Any, dict[str, Any]]:
     )}  # fmt: skip
     layers = ["sliding_attention", "full_attention"]
     text = _text(tokenizer, sliding_window=64, layer_types=layers, query_pre_attn_scalar=8)
-    vision = {**SIGLIP, "image_size": 32, "patch_size": 8}
-    config = Gemma3Config(text_config=text, vision_config=vision, mm_tokens_per_image=4, **ids)
+    config = Gemma3Config(text_config=text, vision_config=SIGLIP_32, mm_tokens_per_image=4, **ids)
     images = Gemma3ImageProcessorPil(size={"height": 32, "width": 32}, do_pan_and_scan=False)
     return config, tokenizer, images, {"image_seq_length": 4}
 
@@ -175,13 +169,7 @@ def _llava_onevision() -> tuple[Any, Any, Any, dict[str, Any]]:
     template = CHATML.replace("IMAGE", "{{ '<image>\n' }}")
     named = {"image_token": "<image>", "video_token": "<video>"}
     tokenizer = make_tokenizer(["<|endoftext|>", *marks], template, "<|im_end|>", **named)
-    vision = {
-        **SIGLIP,
-        "model_type": "siglip_vision_model",
-        "image_size": 32,
-        "patch_size": 8,
-        "vision_use_head": False,
-    }
+    vision = {**SIGLIP_32, "model_type": "siglip_vision_model", "vision_use_head": False}
     text = _text(tokenizer) | {"model_type": "qwen2"}
     ids = {f"{kind}_token_id": tokenizer.convert_tokens_to_ids(f"<{kind}>") for kind in ("image", "video")}
     pins: Any = [[32, 32], [32, 64], [64, 32]]

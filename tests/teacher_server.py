@@ -17,11 +17,8 @@ from cosfly.formats.captions import TOKENS
 from cosfly.llm import client
 from cosfly.runtime.journal import Journal
 
-client.FIRST_PAUSE_S, client.LONGEST_PAUSE_S, client.LOADING_PAUSE_S = (
-    0.01,
-    0.02,
-    0.01,
-)  # no test waits for a server that fails
+client.FIRST_PAUSE_S = client.LOADING_PAUSE_S = 0.01  # no test waits for a server that fails
+client.LONGEST_PAUSE_S = 0.02
 MODEL = "test-teacher"
 ENGLISH = {
     "critical_components": "The target pedestrian is {visibility} and walks on the road ahead of the drone.",

@@ -177,12 +177,8 @@ def test_patterns_and_seeds_give_different_plans():
         yaws = town.layout.rotations_deg[of_kinds(town.layout, "Buildings"), 1] % 90
         is_square = bool((np.minimum(yaws, 90 - yaws) < 1e-6).all())
         assert is_square == (plan.pattern == "grid")
-        return shapely.union_all(
-            [
-                rectangle_polygon(street.rectangle((0.0, street.length_m), (-8.0, 8.0)))
-                for street in town.network.streets
-            ]
-        )
+        rectangles = (street.rectangle((0.0, street.length_m), (-8.0, 8.0)) for street in town.network.streets)
+        return shapely.union_all([rectangle_polygon(rectangle) for rectangle in rectangles])
 
     areas = [streets_of(pattern, 0) for pattern in PATTERNS]
     areas += [streets_of("grid", seed) for seed in (1, 2)] + [streets_of(None, seed) for seed in range(3)]

@@ -12,15 +12,13 @@ import pytest
 from commands import invoke
 from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions, prepared
-from specimens_release import CFG, build, make_inspection
-from specimens_release import make_caption as released_caption
+from specimens_release import CFG, DROPPED, build, make_inspection, release_of
 from tables import each
 
 from cosfly.formats.captions import read_captions, write_captions
 from cosfly.formats.frames import frame_name
 from cosfly.formats.inspection import write_inspection
 from cosfly.formats.playback import Track, read_track
-from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.splits import SPLITS
 from cosfly.inspection.blind_baseline import past_of
 from cosfly.runtime.errors import ConfigError, InputError, ResumeError
@@ -286,11 +284,8 @@ def test_a_window_holds_both_tracks_frame_by_frame(four_walks, windows_of_tracks
         np.testing.assert_array_equal(sample.future_position_m, clean.positions_m[after])
         np.testing.assert_array_equal(sample.future_target_m, clean.targets_m[after])
         # What was added is what the flight's record says was added.
-        np.testing.assert_allclose(
-            np.subtract(sample.observed_position_m, sample.clean_position_m),
-            noisy.perturbation.drone_m[seen],
-            atol=1e-9,
-        )
+        added_m = np.subtract(sample.observed_position_m, sample.clean_position_m)
+        np.testing.assert_allclose(added_m, noisy.perturbation.drone_m[seen], atol=1e-9)
 
 
 def test_a_bad_flight_stops_no_other(tmp_path, four_walks):
@@ -328,15 +323,7 @@ def place(tmp_path_factory) -> Path:
     """tree/, captions.jsonl and release/dataset/ of three walks; the last caption of each flight was dropped."""
     root = tmp_path_factory.mktemp("windows")
     make_playback_tree(root / "tree", 3, NUM_POINTS, width_px=96, height_px=54)
-    dropped = {"status": "dropped", "drop_reason": "hard_conflict"}
-    captions = [
-        released_caption(flight, i, **(dropped if i == NUM_POINTS - 2 else {}))
-        for flight in map(read_track, find_tracks(root / "tree"))
-        for i in range(4, NUM_POINTS - 1)
-    ]
-    write_captions(root / "captions.jsonl", captions)
-    write_inspection(root / "inspect.json", make_inspection(root / "tree", {}))
-    build(root, root / "release", CFG.model_copy(update={"selection": "all"}))
+    release_of(root, changes=lambda one: DROPPED if one.frame_index == NUM_POINTS - 2 else {}, selection="all")
     return root
 
 
