@@ -135,7 +135,8 @@ def test_a_run_has_the_bytes_of_the_local_engine_though_workers_and_nodes_are_lo
     assert differences(contents(tmp_path / "cluster"), contents(tmp_path / "local")) == []
 
 
-def refused(tmp_path: Path, words: str, watch: Watch) -> None:
+def refused(tmp_path: Path, words: str, **cluster: str) -> None:
+    watch = Watch(RayConfig(**cluster))
     with pytest.raises(EnvironmentMissing, match=words) as caught:
         run_items(stage_in(tmp_path), items_of("nothing"), make_faulty, (tmp_path / "s",), workers=1, watch=watch)
     assert "\n" not in str(caught.value)
@@ -145,19 +146,11 @@ def refused(tmp_path: Path, words: str, watch: Watch) -> None:
 @pytest.mark.slow
 def test_where_no_cluster_answers_one_line_says_so(tmp_path, monkeypatch):
     ray.shutdown()
-    refused(
-        tmp_path, r"127\.0\.0\.1:1: no Ray cluster answers.*ray start --head", Watch(RayConfig(address="127.0.0.1:1"))
-    )
+    refused(tmp_path, r"127\.0\.0\.1:1: no Ray cluster answers.*ray start --head", address="127.0.0.1:1")
     with TeacherServer() as server:
         address = server.url.removeprefix("http://").partition("/")[0]
-        refused(
-            tmp_path,
-            "no Ray cluster answers at this address; got no answer of a gRPC server",
-            Watch(RayConfig(address=address)),
-        )
+        refused(tmp_path, "no Ray cluster answers at this address; got no answer of a gRPC server", address=address)
         monkeypatch.setenv("RAY_ADDRESS", address)
-        refused(tmp_path, f"{address}: no Ray cluster answers", Watch(RayConfig()))
+        refused(tmp_path, f"{address}: no Ray cluster answers")
     monkeypatch.setitem(sys.modules, "ray", None)
-    refused(
-        tmp_path, r"the package ray is not installed; pip install -e '\.\[ray\]', on every node", Watch(RayConfig())
-    )
+    refused(tmp_path, r"the package ray is not installed; pip install -e '\.\[ray\]', on every node")
