@@ -4,8 +4,6 @@
 `windows.py` makes both, and nothing that builds a prompt takes a `FutureMotion`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

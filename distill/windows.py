@@ -4,8 +4,6 @@
 tensors. It is a map-style data set that pickles; each worker opens the files again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypedDict

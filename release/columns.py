@@ -5,8 +5,6 @@ how the card counts it. Schema, rows, card and `release verify` follow. Lists ar
 reader of parquet shows plain columns.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Collection, Mapping

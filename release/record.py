@@ -1,7 +1,5 @@
 """`release.json`: the record of a release. Written by build, checked by verify, rendered by card."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The rules that the record of a release states: which frames of a track are released, and how splits are assigned."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

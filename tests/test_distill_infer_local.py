@@ -1,7 +1,5 @@
 """Students that answer in this process: batches, pictures, kills, full memory, constrained answers."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

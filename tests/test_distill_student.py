@@ -6,8 +6,6 @@ them unless told otherwise, takes thoughts from their own field alone, and begin
 unless thinking is off.
 """
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

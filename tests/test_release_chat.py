@@ -149,18 +149,17 @@ def test_what_is_not_a_release_is_refused(two_splits, tmp_path, format):
 @contextmanager
 def full_disk() -> Iterator[None]:
     """Limit the size of files: the system cuts the write that exceeds it, as on a full disk."""
-    limits, writes_bytecode = resource.getrlimit(resource.RLIMIT_FSIZE), sys.dont_write_bytecode
-    sys.dont_write_bytecode = True  # a module imported here would leave a cut file in __pycache__
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (DISK_BYTES, limits[1]))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        sys.dont_write_bytecode = writes_bytecode
 
 
 @pytest.mark.parametrize("format", EXPORTS)
-def test_a_full_disk_leaves_nothing_half_written(two_splits, tmp_path, format):
+def test_a_full_disk_leaves_nothing_half_written(two_splits, tmp_path, format, monkeypatch):
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # a module imported now would be cut in __pycache__
     out = tmp_path / "out"
     with full_disk(), pytest.raises(StorageError, match="the file cannot be written") as caught:
         exported(two_splits, out, format)

@@ -6,8 +6,6 @@ compared with the facts as those of prose. Prose: the paper's three plain fields
 and for texts by somebody else; the numbers with a unit are compared with the facts.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ of the same quantity and frames it is written without its sign. A word takes the
 (verification/values.py).
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache

@@ -5,8 +5,6 @@ when its last window is done. Windows without an answer, and those that the serv
 until a later run gets an answer.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import time

@@ -4,8 +4,6 @@ Reads a playback tree, writes `compare_strategies.json` and, for an endpoint, it
 none of it.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import itertools

@@ -1,7 +1,5 @@
 """The outcomes of windows: the reasons to drop one, counts that add up, and `report.html`, a page with samples."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest

@@ -3,8 +3,6 @@
 A reader for `cosfly release verify`, which gives all points of a track, also those whose frames are not released.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from dataclasses import replace

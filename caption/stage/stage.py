@@ -4,8 +4,6 @@ Teachers that ask no model work on tracks in several processes; models are asked
 finished track is a part file; the parts are merged at the end, so that memory stays flat.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import math

@@ -5,8 +5,6 @@ does not count as finished under another limit; one with an unanswered window is
 removed when nothing can be added to the product.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

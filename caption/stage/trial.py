@@ -4,8 +4,6 @@ The windows are real ones, spread over the tracks. Their answers stay in the jou
 again.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Iterator
 from itertools import islice

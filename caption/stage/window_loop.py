@@ -4,8 +4,6 @@ Every window has one outcome: accepted, dropped for a reason, or failed because 
 that the trajectory contradicts is asked for again, by default anchored to the label; the record says so.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from caption.answer_formats.formats import THEREFORE, Draft, Refused

@@ -4,8 +4,6 @@ Servers answer 200 to much that they ignore, so the checks of schema and picture
 answer or in the count of tokens.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import time

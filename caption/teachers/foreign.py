@@ -4,8 +4,6 @@ A file has one line per window: sample_id, en {three fields} and, if the writer 
 are `predictions.jsonl`. No answer can be asked for again; a window without one is dropped.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -4,8 +4,6 @@ A judgement that cannot be read is `unjudged`, never an acceptance. Judgements a
 and count in the same budget. `check_judge` measures a judge on a small gold set before its verdicts are used.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections import Counter
 from collections.abc import AsyncIterator, Sequence

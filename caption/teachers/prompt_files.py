@@ -4,8 +4,6 @@ Each file begins with a line `# version: ...`; the rest is the prompt, with `$sl
 dollar sign.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Nothing here reads the future. Every caption records the hash of its question.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache

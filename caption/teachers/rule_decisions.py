@@ -4,8 +4,6 @@ The motion of drone and target is extrapolated and compared with what each manoe
 motion to expect is fitted on training towns, for tracks with and without perturbation.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

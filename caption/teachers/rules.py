@@ -5,8 +5,6 @@ teacher's are. A sentence is used only where its condition holds: CONDITIONS nam
 `rule_sentences.yaml` has the sentences of each. Records say `kind: rules`: it is no model and sees no picture.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence

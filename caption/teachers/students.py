@@ -4,8 +4,6 @@ That is the paper's stage 3: tracks without labels get their captions from a stu
 like those of any other teacher.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from functools import partial

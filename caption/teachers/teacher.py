@@ -5,8 +5,6 @@ an engine (cosfly/llm); every answer is journaled before it is used. `ask` answe
 Chinese of an English answer; its complaint says what was wrong with the last one.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Executor, ThreadPoolExecutor

@@ -5,8 +5,6 @@ decision of which the future shows next to nothing is contradicted. `break_off` 
 mission: its metadata give them, geometry never does. Signs: left, up and forward are positive.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ Values are rounded here, once, as they are printed, so that a text and its check
 fact is named and looked up: references.py.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The words of both languages, `glossary.yaml`: the one reader of them."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterable

@@ -5,8 +5,6 @@ swapped. A text that was asked for as a translation must also have the same sent
 (`check_translation`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import product
 

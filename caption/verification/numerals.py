@@ -1,7 +1,5 @@
 """Numbers in running text, in digits, with the units behind them, in English and Chinese."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from functools import cache

@@ -11,8 +11,6 @@
 `look_up` returns the fact at an address, or why there is none.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Sequence

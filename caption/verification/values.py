@@ -5,8 +5,6 @@ matched: it may still be the wrong quantity. Where its clause names one quantity
 count. A number that matches none is contradicted. Words are not checked, and neither are numbers in words.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 from typing import NamedTuple

@@ -3,8 +3,6 @@
 Nothing heavy is imported before a command runs, so `cosfly --help` is instant.
 """
 
-from __future__ import annotations
-
 import importlib
 import logging
 import os

@@ -1,7 +1,5 @@
 """The commands `cosfly distill ...` of students, and `cosfly fly` and `cosfly leaderboard`, which measure them."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The commands `cosfly release ...` and `cosfly view`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

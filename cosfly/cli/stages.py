@@ -1,7 +1,5 @@
 """The commands of steps 1 to 6: `cosfly world`, `maps`, `simplify`, `pedestrians`, `roi`, `plan`, `render` ..."""
 
-from __future__ import annotations
-
 import re
 import time
 from pathlib import Path

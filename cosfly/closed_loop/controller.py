@@ -4,8 +4,6 @@ It knows the drone's pose, its home position and its height, but never the targe
 the point ahead of the drone, at hip height, at which it looks when the episode begins.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

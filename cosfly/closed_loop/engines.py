@@ -4,8 +4,6 @@ An engine gets the last frames of several episodes and returns a decision for ea
 as the student's failure, and the episode goes on.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 import shutil

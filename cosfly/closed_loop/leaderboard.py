@@ -3,8 +3,6 @@
 A table contains only students with the same episodes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal

@@ -7,8 +7,6 @@ success rate is the share of time with a visible target (our `in_view`). UAV-Tra
 269.65 tracked frames on far pedestrians in CARLA without a definition that we could find: these are not comparable.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from itertools import groupby

@@ -4,8 +4,6 @@ The class has `reset(goal, seed)` and `act(observation)`, which returns a decisi
 as ACTION. Its errors are recorded as its answers, and the episode goes on.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import signal

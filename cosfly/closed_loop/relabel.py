@@ -6,8 +6,6 @@ The planner knows the whole pedestrian trajectory. It plans from the pose and ve
 planner's, with captions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Settings of the closed loop: the drone's limits and `cosfly fly`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self

@@ -4,8 +4,6 @@ A worker has one renderer and one engine. It flies the episodes of an item in st
 one batch to the student. An episode is on the disk once it has ended.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import os

@@ -3,8 +3,6 @@
 They render, simulate and measure as `cosfly fly` does, and need neither a GPU nor a simulator.
 """
 
-from __future__ import annotations
-
 from cosfly.envs.episodes import TASKS
 from cosfly.runtime.errors import EnvironmentMissing
 

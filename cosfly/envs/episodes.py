@@ -4,8 +4,6 @@ A town is a preset and a seed. The seeds of HELD_OUT are for tests only: no conf
 them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The environment: follow a pedestrian through a town. Observations contain only what a real drone can measure."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Sequence
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """`cosfly fly --env`: a student in a fixed list of episodes, with the records and the score of `cosfly fly`."""
 
-from __future__ import annotations
-
 from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path

@@ -5,8 +5,6 @@ Each frame has the visibility of the target, the student's answer to it, and the
 World axes: right-handed, metres, degrees.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Annotated, Literal, Self

@@ -4,8 +4,6 @@ Depth is float32: `depth_float32.png`, packed without loss, or `depth.npy` as in
 file by its name in the public layout. `meta.json` uses CARLA's axes (left-handed), `FrameMeta` those of the project.
 """
 
-from __future__ import annotations
-
 import io
 import os
 from dataclasses import dataclass

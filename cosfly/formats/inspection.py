@@ -5,8 +5,6 @@ people on tracks that the inspection left in review (`cosfly inspect review`).
 inspection by the digest of its file and counts for that inspection only.
 """
 
-from __future__ import annotations
-
 import logging
 from collections import Counter
 from collections.abc import Iterable

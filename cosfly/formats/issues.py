@@ -1,7 +1,5 @@
 """Findings of inspection and of `release verify`: one type, printed in one way."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal
 

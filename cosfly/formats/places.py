@@ -1,7 +1,5 @@
 """Folders and ids of tracks and samples in a playback tree: `Town*/trajectory_<unix seconds>/<variant>/`."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections import defaultdict

@@ -9,8 +9,6 @@ The files use CARLA's left-handed axes. This module converts those of `trajector
 `meta.json`; all other code uses right-handed axes. Unknown keys are kept in `Track.raw` and are written again.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from dataclasses import asdict, astuple, dataclass, field, replace

@@ -1,7 +1,5 @@
 """`predictions.jsonl`, a student's answers: written by `distill infer`, read by `distill evaluate` and `caption`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """`roi_polygon.json`, where pedestrians may walk: the paper's form, and ours with holes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import shapely

@@ -3,8 +3,6 @@
 A trajectory without them, as in the paper, follows the target from beginning to end.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any, Literal, get_args
 

@@ -3,8 +3,6 @@
 `release` reads rows and pictures, `caption` checks labels and verdicts; the command line passes one to the other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,8 +1,6 @@
 """Files in a town's folder of the playback tree: `map.json` (name and licence of the map) and `instance_ids.json` (the
 box of each id in `instance.png`)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tracks of a playback tree: find and choose them, and read the clean twin of a perturbed one."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Weather and time of day: the paper's presets, six parameters, and the record in a track's files (app:weather)."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field

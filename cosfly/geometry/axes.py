@@ -8,8 +8,6 @@ Cameras are OpenCV cameras (x right, y down, z forward) and depth is z-depth.
 CARLA and Unreal are left-handed (y to the right, yaw clockwise): `mirror_poses` converts in both directions.
 """
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import numpy as np

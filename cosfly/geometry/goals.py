@@ -4,8 +4,6 @@ A description is a tuple of slots of clothing and relations (SIDES). It is measu
 positions from ids and depth of the picture. `meant` computes from the same data whom a goal describes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations

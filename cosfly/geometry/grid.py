@@ -5,8 +5,6 @@ free cells, and connected components of them are labelled. Arrays are indexed [y
 (x_index, y_index) covers one square of `resolution_m`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ take single coordinates are for other compiled code; those that take arrays chec
 parallel: the stages distribute items over processes.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

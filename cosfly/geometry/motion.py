@@ -4,8 +4,6 @@ Both come from the planned motion, as labels do: a perturbation that is drawn fo
 perturbed frame, the waypoints lead back to the plan.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

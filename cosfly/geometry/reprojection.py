@@ -4,8 +4,6 @@ Points of one depth image are moved into the other camera. There a static surfac
 and the same instance. Colours are not compared, because light, weather, zoom and renderers change them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

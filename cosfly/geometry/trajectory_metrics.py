@@ -1,7 +1,5 @@
 """Trajectory metrics: dynamics by discrete differentiation, distances, visibility (sec:step6)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from cosfly.formats.episodes import Figure

@@ -3,8 +3,6 @@
 `past_of` makes a row of numbers from a window; a network and a decision tree (the rule) are fitted on such rows.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

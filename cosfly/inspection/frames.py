@@ -4,8 +4,6 @@ with each other.
 Issues go into a Report, figures into FrameNumbers; the thresholds of acceptance are in track.py.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path

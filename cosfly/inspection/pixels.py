@@ -5,8 +5,6 @@ surfaces lie in one plane, rounding decides which of them is drawn at each pixel
 a column while the depth is that of one plane. It counts only where the colours or the kinds differ visibly.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

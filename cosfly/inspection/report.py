@@ -3,8 +3,6 @@
 It shows the figures, the issues and three pictures of each track; `viewer.html` has its trajectory on the map.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path

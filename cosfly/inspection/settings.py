@@ -1,7 +1,5 @@
 """The thresholds of the inspection, with their reasons."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import Field

@@ -3,8 +3,6 @@
 Changes nothing in the tree. The package is not called `inspect`, which would hide the standard library's module.
 """
 
-from __future__ import annotations
-
 import logging
 from collections import Counter
 from pathlib import Path

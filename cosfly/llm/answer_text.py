@@ -1,7 +1,5 @@
 """The form of an answer of a teacher or student: its JSON schema, and the check of a raw answer (sec:appendix_e)."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass

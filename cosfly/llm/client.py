@@ -3,8 +3,6 @@
 The key comes from the environment variable COSFLY_API_KEY and is sent in the request header only.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import functools

@@ -3,8 +3,6 @@
 An engine knows no captions, journals or budgets: it is started, answers many requests at once, and is closed.
 """
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal

@@ -5,8 +5,6 @@ text of the server, by one table for all servers, `refusals.yaml`. The patterns 
 llama.cpp, TGI, LM Studio, LiteLLM, OpenAI and similar hosts; tests/refusals.tsv lists them.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

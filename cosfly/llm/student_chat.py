@@ -1,7 +1,5 @@
 """The chat of a student: prompt, order of pictures and their pixels, identical in training, inference and serving."""
 
-from __future__ import annotations
-
 import base64
 import math
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ Tested with vLLM 0.26 (docs/benchmarks.md has the figures). vLLM runs in its own
 answered (`LLM.enqueue_chat`, `LLMEngine.step`), and a refused request does not affect others.
 """
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import importlib.util

@@ -6,8 +6,6 @@ piece. A row that cannot be used is skipped and counted; too many of them refuse
 overlaps are logged for the user.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import logging

@@ -4,8 +4,6 @@ Known defects of such exports are counted: labels without objects, repeated obje
 one huge box around all of the terrain or the vegetation.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor

@@ -5,8 +5,6 @@ thin slabs that never obstruct a pedestrian. Green areas with the heights of the
 they rise over the ground.
 """
 
-from __future__ import annotations
-
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterator

@@ -4,8 +4,6 @@ With them `with_derived_ground` lays ground into a map of buildings without stre
 (`derived_ground`), and its credits, that every release repeats, say so.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple

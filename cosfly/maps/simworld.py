@@ -6,8 +6,6 @@ the full size in the table times the node's scale. The table lacks sizes of stre
 own surfaces, such as those of `cosfly world`, gets none added. `header.extent_sources` counts the sources of sizes.
 """
 
-from __future__ import annotations
-
 import logging
 from collections import Counter
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stage 1: a map of boxes. Each source is a module with `load(its settings, seed) -> BoxMap`."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The parts of generated towns: trees, benches, paint and furniture of streets, and the kinds of building blocks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

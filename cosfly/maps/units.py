@@ -4,8 +4,6 @@ Without a library of coordinate systems: those of metres that map makers use are
 degrees, and any other needs the setting `units`.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import re

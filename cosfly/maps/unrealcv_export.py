@@ -6,8 +6,6 @@ aligned with the world's axes; for a turned object the turned box with these bou
 names (`id_of`).
 """
 
-from __future__ import annotations
-
 import logging
 from collections import Counter
 from collections.abc import Iterator

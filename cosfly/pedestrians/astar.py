@@ -6,8 +6,6 @@ kept as two integers, the weighted straight and diagonal steps, so that equal co
 steps: the result is the true optimum, not the optimum up to rounding, and ties break the same way everywhere.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

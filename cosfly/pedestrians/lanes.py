@@ -4,8 +4,6 @@ A box of Roads that is longer than wide is a street; streets that cross, or that
 junction. Maps whose roads are patches have no lanes and no cars.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import combinations, pairwise

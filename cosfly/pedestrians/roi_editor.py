@@ -3,8 +3,6 @@
 The page only draws: this module computes the walkable ground of a region with the code of the pedestrian stage.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import logging

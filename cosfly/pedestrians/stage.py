@@ -5,8 +5,6 @@ in the one or two steps next to a corner. Without collinear waypoints the low sp
 straight segment behind it (0.92 instead of 1.07 m/s on the same 40 routes of a test town).
 """
 
-from __future__ import annotations
-
 import colorsys
 import logging
 from collections import Counter

@@ -1,7 +1,5 @@
 """`cosfly doctor`: check what works on this machine, and how to fix what does not."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import importlib.util
 import platform

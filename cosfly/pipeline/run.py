@@ -1,7 +1,5 @@
 """`cosfly run`: the stages in order, in one run directory. Resumes where it stopped."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import platform

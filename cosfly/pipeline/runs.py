@@ -1,7 +1,5 @@
 """Summaries of run directories (stages, items, disk), and estimates of the time and disk of a run, by stage."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

@@ -5,8 +5,6 @@ moves from voxel to voxel. Here dynamic programming over rings around the refere
 tenth of the places, and a least-squares trajectory follows them as closely as visibility and safety require.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

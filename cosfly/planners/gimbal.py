@@ -4,8 +4,6 @@ The gimbal is a second-order loop per axis. It turns to where the target was `de
 varies smoothly with time. The faster the target moves through the picture, the farther the camera lags behind it.
 """
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np

@@ -4,8 +4,6 @@
 here the boxes around the target are sorted by direction once, and a point tests only those in its direction.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Top-down pictures of trajectories: `plan.png` and `compare_overlay.png`."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -16,8 +16,6 @@ Sources: Hart, Nilsson and Raphael 1968; Pohl 1970 (the weight); Daniel et al. 2
 Karaman and Frazzoli 2011 (RRT*); Kavraki et al. 1996 (PRM); Koyuncu and Inalhan 2008 (B-spline PRM).
 """
 
-from __future__ import annotations
-
 import heapq
 import itertools
 from collections.abc import Callable

@@ -8,8 +8,6 @@ ones are pulled harder, up to a limit; those too near a box or too fast are pull
 those too near a box are moved away from it, and the others stay.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d

@@ -5,8 +5,6 @@ row needs no code. Labels come from the planned motion, not from the style. Two 
 needs a place where the target disappears, `return_home` ends with a mission.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any

@@ -16,8 +16,6 @@ not the terms; the terms are these, per layer:
 The move before a state is that of its cheapest predecessor: the smoothness term sees one past, not all.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cameras of a trajectory, and the target in their view: box, depth, visibility, legibility (sec:step6)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

@@ -3,8 +3,6 @@
 Each frame is one synchronous tick of three cameras in one place. Boxes that CARLA does not have get no id.
 """
 
-from __future__ import annotations
-
 import logging
 import multiprocessing
 import os

@@ -10,8 +10,6 @@ All renderers draw the same things in the same places, so that depth, kinds and 
 - of coplanar surfaces the one of the higher layer, and within a layer always the same one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol

@@ -4,8 +4,6 @@ It draws plain boxes, trees and figures. Each frame is drawn three times in segm
 float32 bits of the depth: pyrender's own depth is wrong by centimetres at 30 m.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The shared part of renderers of running simulators: settings, retries of a frame, lens, placement of movers."""
 
-from __future__ import annotations
-
 import logging
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar

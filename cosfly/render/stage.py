@@ -1,7 +1,5 @@
 """Stage 5: drone trajectories to a playback tree: RGB, depth and instance frames of a clean and a perturbed track."""
 
-from __future__ import annotations
-
 import importlib
 import logging
 import os

@@ -1,8 +1,6 @@
 """What all renderers share: the layers, which decide which of several surfaces at one place is visible, and the
 triangles of meshes, which are drawn instead of boxes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

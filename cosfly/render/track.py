@@ -1,7 +1,5 @@
 """One track to one folder of the playback tree: draw, annotate, encode, write; encoding runs while frames are drawn."""
 
-from __future__ import annotations
-
 import copy
 from collections import deque
 from collections.abc import Callable

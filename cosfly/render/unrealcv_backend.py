@@ -5,8 +5,6 @@ identifies an object, and the object's name identifies its box. The level is com
 scale the camera would be at a wrong place.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import time

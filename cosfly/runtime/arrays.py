@@ -1,7 +1,5 @@
 """NumPy arrays (`.npy`). The header is checked before memory is allocated for the sizes in it."""
 
-from __future__ import annotations
-
 import io
 import math
 import threading

@@ -9,8 +9,6 @@ own and compiles the function once more. Set whole arrays by `fill` or a loop, b
 the formatting of its error message.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import itertools

@@ -4,8 +4,6 @@ Settings are YAML with the values of JSON, comments and anchors. A tag, a repeat
 number are errors; a date is text.
 """
 
-from __future__ import annotations
-
 import copy
 import importlib.resources
 from collections.abc import Iterable, Iterator

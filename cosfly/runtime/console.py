@@ -1,7 +1,5 @@
 """The terminal: one console that log lines and progress bars share, so that neither breaks the other."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import time

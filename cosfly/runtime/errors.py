@@ -3,8 +3,6 @@
 A *fatal* error ends the stage; any other, raised inside one item, is recorded for that item and counted.
 """
 
-from __future__ import annotations
-
 import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches

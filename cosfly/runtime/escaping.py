@@ -3,8 +3,6 @@
 Names of folders, contents of files and answers of servers may hold escape sequences, tags, table bars, or 200 MB.
 """
 
-from __future__ import annotations
-
 import html
 import re
 

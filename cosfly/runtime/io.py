@@ -4,8 +4,6 @@ A pipe could block forever, a device never ends, and a link may lead out of a tr
 the system about a file to InputError or StorageError.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import gzip

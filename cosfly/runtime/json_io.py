@@ -4,8 +4,6 @@ Reading refuses more than JSON forbids: numbers that are not finite (NaN, 1e999)
 nesting deeper than DEPTH, half a surrogate pair, which cannot be written again, and too many lists and objects.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import math

@@ -1,7 +1,5 @@
 """The CPUs and the memory that this process may use: a job or a container has less than its machine."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterator

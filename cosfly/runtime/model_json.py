@@ -7,8 +7,6 @@ escaped string there. Nothing is completed or guessed: an object without an end,
 is a failure with a reason.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Collection

@@ -7,8 +7,6 @@ upper neighbours. Instance masks: no filter. Depth: the four channels of a pixel
 first, and each row is stored as the difference to the row above.
 """
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Random numbers derived from (seed, stage, item), so that none depends on the workers, their order or a resume."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator, Mapping
 from itertools import count

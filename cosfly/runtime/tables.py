@@ -1,7 +1,5 @@
 """Parquet files of bounded size, read row group by row group; damage becomes an InputError."""
 
-from __future__ import annotations
-
 import bisect
 import contextlib
 import io

@@ -3,8 +3,6 @@
 `pool` is at the other end of the pipe.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import ctypes

@@ -6,8 +6,6 @@ them (`min_fill`, `min_canopy_fill`); *crop_tree* leaves stems below the cut, no
 can walk below a tree (`trunk`). The variants of the paper's SimWorld runs (app:simworld:step3) are settings.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal

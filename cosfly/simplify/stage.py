@@ -1,7 +1,5 @@
 """Stage `simplify`: the passes over one map, a report of the walkable ground that they cost, and a picture."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The kinds of a SimWorld city's assets, by name, and of a level's objects, by class: `assets.yaml`."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from fnmatch import fnmatchcase

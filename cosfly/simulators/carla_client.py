@@ -1,7 +1,5 @@
 """A checked connection to a CARLA server: its settings, and errors that name host, port and version."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ BGRA bytes: depth in 24 bits up to 1000 m, tags as the semantic number in red an
 and blue (high byte).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -12,8 +12,6 @@ guard restores nothing if it received no line.
     unrealcv  a list of commands that restore the camera          (none)
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -2,8 +2,6 @@
 It works around faults of the package `unrealcv`, which waits forever for a greeting, reads from closed connections,
 and prints. A server has one client at a time."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import logging

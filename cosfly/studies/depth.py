@@ -3,8 +3,6 @@
 Integers of 8 to 16 bits divide the frame's own range evenly, as in the paper. The reference is the file's float32.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

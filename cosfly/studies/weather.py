@@ -1,7 +1,5 @@
 """One view under every weather and time of day: the paper's nine pictures, and a sheet of all presets (app:weather)."""
 
-from __future__ import annotations
-
 import contextlib
 from itertools import product
 from pathlib import Path

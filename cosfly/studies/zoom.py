@@ -5,8 +5,6 @@ target's projected 3D box, its rendered visibility, and the IoU of that box with
 quality). Means are taken over the frames of a track that show some of the target, then over tracks.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

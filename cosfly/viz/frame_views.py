@@ -1,7 +1,5 @@
 """Frames as pictures, the same for teachers, students, contact sheets and reports."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Overviews of a playback tree: a contact sheet, an animation of one track, four pictures of a frame."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

@@ -4,8 +4,6 @@ distances.
 The boxes are projected again from `meta.json` and the map, so a line that does not fit reveals an error in either.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

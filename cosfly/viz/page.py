@@ -3,8 +3,6 @@
 Texts that a template prints are cut and escaped, except the markup of templates, style and script.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """A web server of one page, for this machine only."""
 
-from __future__ import annotations
-
 import contextlib
 import hmac
 import json

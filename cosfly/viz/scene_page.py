@@ -3,8 +3,6 @@
 Arrays are embedded as base64; the page's script draws them (`space.js`, WebGL 2) and plays them back.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass, field

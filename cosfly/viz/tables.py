@@ -1,7 +1,5 @@
 """A table of text, for the terminal and for a page of Markdown."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Places on a picture are floats, px from its top left corner, rounded to a sixteenth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product

@@ -4,8 +4,6 @@ The data are JSON with the names that `viewer.js` reads; the script writes every
 and the page's policy lets no other script run.
 """
 
-from __future__ import annotations
-
 import base64
 from collections import defaultdict
 from collections.abc import Hashable, Iterator, Mapping, Sequence

@@ -3,8 +3,6 @@
 Source: app:simworld:step1, the structured high-level plan.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, Self

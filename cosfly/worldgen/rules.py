@@ -6,8 +6,6 @@ the words that were not used. The order of the phases is the grammar; `_Reader.r
 Source: an alternative to the language model of app:simworld:step1 where no endpoint is given.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable
@@ -379,12 +377,12 @@ def _limited(heights_m: Any, low_m: float, high_m: float | None, *, is_replaced:
     if high_m is None:
         least_m = max(low_m, least_m, LOWEST_M)
         # Above a lower limit buildings still differ, by a fifth.
-        most_m = max(min(most_m, HIGHEST_M), 1.2 * least_m if low_m else least_m)
+        most_m = max(most_m, 1.2 * least_m if low_m else least_m)
     else:
         most_m = high_m if is_replaced else min(most_m, high_m)
         least_m = max(low_m, min(least_m, 0.6 * most_m), LOWEST_M)  # 0.6: they differ below an upper limit too
         most_m = max(most_m, least_m)
-    return min(least_m, HIGHEST_M), most_m
+    return min(least_m, HIGHEST_M), min(most_m, HIGHEST_M)
 
 
 def _metres(unit: str) -> float:

@@ -1,7 +1,5 @@
 """`cosfly world PROMPT`: from a prompt to a world that SimWorld and our importer load (app:simworld:step1)."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import re

@@ -5,8 +5,6 @@ middle of the town, +x is east and +y north. Boxes have the yaw of their street.
 paint and the ground below a few centimetres lower, so that no two share a plane.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

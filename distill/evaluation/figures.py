@@ -5,8 +5,6 @@ not parse is one: it decides nothing, and its texts score 0. Windows of a track 
 whole pedestrian trajectories are drawn, and everybody is measured on the same draws.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace

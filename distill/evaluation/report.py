@@ -1,7 +1,5 @@
 """The report of an evaluation: `report.json`, and its tables as a page."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from cosfly.formats.captions import FIELDS, TOKENS, Coc, Language

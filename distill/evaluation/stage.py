@@ -4,8 +4,6 @@ The reference is the teacher's accepted answer, as in the paper. Agreement with 
 the motion after the window are measured too.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence

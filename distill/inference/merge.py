@@ -1,7 +1,5 @@
 """An adapter merged into its base: a model folder for transformers, vLLM and any server."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

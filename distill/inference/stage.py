@@ -1,7 +1,5 @@
 """Let a student answer the samples of a split: in this process, or through an engine as teachers are asked."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging

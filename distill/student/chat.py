@@ -4,8 +4,6 @@ Prompt and answer are tokenized apart and joined, as in inference: no token span
 loss on the answer is exact.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping, Sequence

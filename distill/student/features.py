@@ -3,8 +3,6 @@
 A frame is part of up to five windows, in two languages, in every epoch, and a frozen tower always encodes it the same.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import math

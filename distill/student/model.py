@@ -3,8 +3,6 @@
 A student is a folder, the name of a repository on a hub, or a GGUF file. Only `student_path` uses the network.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import inspect

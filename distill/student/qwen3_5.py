@@ -1,7 +1,5 @@
 """Faster code for students of Qwen3.5's structure (3.5, 3.6, 3.8) on an accelerator; no other family is known here."""
 
-from __future__ import annotations
-
 import importlib.util
 import logging
 import sys

@@ -1,8 +1,6 @@
 """Students of random weights in Qwen3.5's structure, from 0.3 million parameters up, with a tokenizer trained on the
 training set: for a try on a laptop, and for experiments with a student that knows nothing before."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any

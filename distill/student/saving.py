@@ -1,7 +1,5 @@
 """Adapters and whole models on disk: tensors in safetensors, the rest in JSON, nothing that a file could run."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

@@ -1,7 +1,5 @@
 """Checkpoints of a training: the weights that learn, the optimizer's state, the progress; and the log up to them."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ Every random choice derives from (seed, epoch) or (seed, step, process), so a tr
 the same steps as one that was not; a checkpoint needs no generator state.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import math

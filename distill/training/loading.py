@@ -1,7 +1,5 @@
 """Data of a training: the samples that are used, as tokens, and the features of their pictures."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal

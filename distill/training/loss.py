@@ -6,8 +6,6 @@ computed together, and only what has the width of the network is kept (fused lin
 2024, Liger Kernel).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache
 from typing import Any

@@ -3,8 +3,6 @@
 The loss counts answer tokens only, and nothing is ever cut: a sample that does not fit is skipped and counted.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import math

@@ -1,7 +1,5 @@
 """Which captions are released: the accepted ones, by track, and an account of all. Only their places are in memory."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field

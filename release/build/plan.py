@@ -1,8 +1,6 @@
 """Which tracks are released and which shard holds them: decided before any is written, so that neither the number of
 workers nor a kill changes it."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections import Counter, defaultdict

@@ -3,8 +3,6 @@
 A worker writes whole shards, so that no byte is written twice.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path

@@ -5,8 +5,6 @@ release.json, checksums.sha256), which is published whole or not at all and hold
 of the stage are next to it: they hold local paths and are not published.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import platform

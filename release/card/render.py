@@ -5,8 +5,6 @@ In words it says only what the record gives grounds for. Where it gives none, th
 prints is escaped.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

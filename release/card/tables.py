@@ -4,8 +4,6 @@ All of it is in release.json, which `release verify` compares with the rows. The
 `cosfly release stats` draws them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from statistics import fmean

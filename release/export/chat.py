@@ -7,8 +7,6 @@ A sample is a window in one language: its pictures, oldest first, the question, 
 pictures are relative to the folder of the export.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 from collections import Counter

@@ -6,8 +6,6 @@ Masks and boxes are those of the pixels in `instance.png`, as run-length codes t
 them. The target and the other people are two categories of the supercategory person.
 """
 
-from __future__ import annotations
-
 import itertools
 import shutil
 import tempfile

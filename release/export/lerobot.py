@@ -8,8 +8,6 @@ The task of a frame is the goal of its track and the decision of its caption, in
 bytes, depth is TIFF of float32, LeRobot's own lossless form. The constants are those of lerobot 0.4.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import itertools

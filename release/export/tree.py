@@ -7,8 +7,6 @@ and `source.released_frames` has their indices in the release. Several runs beco
 name.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 from itertools import groupby

@@ -8,8 +8,6 @@ the texts, flags and numbers that no frame lacks; a missing text is empty. A num
 float64 array of its own: NaN, or an array without elements. The bytes depend on the rows alone.
 """
 
-from __future__ import annotations
-
 import tarfile
 from collections import Counter
 from collections.abc import Iterator

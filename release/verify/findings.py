@@ -1,7 +1,5 @@
 """The findings of a verification: one line for each kind of problem, with its count and the first places."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -2,8 +2,6 @@
 cameras of neighbouring frames show one world. Colours are not compared: weather, light and renderers change them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

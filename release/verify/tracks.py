@@ -1,7 +1,5 @@
 """Check the tracks of a shard in a worker process: rows, points, captions, pictures."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence

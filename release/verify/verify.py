@@ -7,8 +7,6 @@
 `cosfly inspect` checks a playback tree, `sha256sum -c checksums.sha256` an export.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import tempfile

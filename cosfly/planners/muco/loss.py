@@ -6,8 +6,6 @@ Gauss-Newton: a square w r^2 with dr/dp = a adds 2 w a a^T. It is a band matrix,
 neighbours.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

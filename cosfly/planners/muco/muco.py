@@ -6,8 +6,6 @@ Gauss-Newton model instead, caps it per waypoint, projects, and is shortened unt
 is repaired to `plan.accel_max_mps2`. `step: paper` is the paper's optimizer as printed, without that limit.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 

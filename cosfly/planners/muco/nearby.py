@@ -5,8 +5,6 @@ several iterations. Results do not depend on the cache: for a waypoint that has 
 it, the index is queried.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -5,8 +5,6 @@ time of an evaluation. Loops replace NumPy's whole-array forms, because each sha
 Literals are passed as `int64(1)` and `boolean(False)`, so that a function is compiled for one signature only.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

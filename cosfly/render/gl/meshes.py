@@ -3,8 +3,6 @@
 Vertices are (n, 6) float32: position and unit normal. Triangles are (k, 3) int32, counter-clockwise seen from outside.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

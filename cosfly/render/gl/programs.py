@@ -1,7 +1,5 @@
 """Programs and buffers of the default renderer: one set for each kind of weather, uniforms, loose triangles."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A map ready to be drawn: the parts of every box, the ground plane, meshes, and lamps."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 All parts stay inside their box, so that the planners' collision and visibility checks hold.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
