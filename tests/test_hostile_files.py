@@ -259,12 +259,7 @@ def test_a_key_in_an_address_is_never_shown():
         with pytest.raises(ValueError, match="must start with http") as refused:
             check_url(address)
         assert "SECRET99" not in str(refused.value)
-    for text in (
-        "https://host.org:8000/openai/gpt-4o-mini/v1",
-        "key=value",
-        "10:30 at Delft",
-        "{change:distance@t2-t4}",
-    ):
+    for text in ("https://host.org:8000/openai/gpt-4o/v1", "key=value", "10:30 at Delft", "{change:distance@t2-t4}"):
         assert for_terminal(text) == text
 
 
