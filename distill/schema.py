@@ -116,7 +116,7 @@ def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
     found = {fingerprint(path): path for path in data if wanted}  # none for a set without pictures
     for digest, path in found.items():
         if digest not in wanted.values():
-            what = "the training set was not made of this playback tree"
+            what = "the training set was not made from this directory of rendered tracks"
             expected = ", ".join(f"{run}: {sha256}" for run, sha256 in wanted.items())
             fix = "pass the unchanged trees of the training set, or prepare a training set from this tree"
             raise InputError(what, where=path, got=f"the digest {digest}", expected=expected, fix=fix)

@@ -228,7 +228,7 @@ def bounded(value: float) -> float:
     """Return a value that a track can have; raise InputError if it is no finite number, or beyond LARGEST."""
     if not -LARGEST < value < LARGEST:  # NaN is not
         expected = f"a number from {-LARGEST:g} to {LARGEST:g}"
-        raise InputError("a number of a track is out of range", where="data", got=str(value), expected=expected)
+        raise InputError("a value of a track is out of range", where="data", got=str(value), expected=expected)
     return value
 
 

@@ -118,7 +118,7 @@ def test_longitude_and_latitude_become_metres(tmp_path, subtests):
         loaded(tmp_path, collection(*town), ".geojson", units="m")
     with pytest.raises(InputError, match="too large to be degrees"):
         loaded(tmp_path, collection(*houses()), ".geojson", units="degrees")
-    with pytest.raises(InputError, match="may be metres or degrees"):
+    with pytest.raises(InputError, match="fit both metres and degrees"):
         loaded(tmp_path, collection(*houses(scale=0.01)), ".geojson")
     lake = feature("Polygon", square(4.0, 52.0, 0.03), type="Roads")
     assert loaded(tmp_path, collection(lake, crs=crs("EPSG:4326")), ".geojson").half_extents.max() > 1_000

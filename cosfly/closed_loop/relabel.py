@@ -46,7 +46,7 @@ def run(
     plans = read_traces(flown / PLAN / TRACES)
     if (planners := {plan.planner for plan in plans} | {cfg.plan.planner}) != {"foresight"}:
         raise ConfigError(
-            "relabeling needs the planner foresight, because no other planner can start at the pose of a student",
+            "relabeling needs the planner `foresight`, because no other planner can start at the pose of a student",
             where=f"plan.planner and {flown / PLAN}",
             got=f"the planners {', '.join(sorted(planners))}",
             fix="fly the student again with --set plan.planner=foresight, and relabel with the same setting",

@@ -290,7 +290,7 @@ def read_boxes(path: Path) -> BoxMap:
         for name in UNIT_FIELDS & value.keys():
             if str(value[name]).lower() not in ("m", "metre", "metres", "meter", "meters", "none"):
                 raise InputError(
-                    "the map declares another unit or coordinate system than that of boxes_3d.json",
+                    "the file declares another unit or coordinate system than the format boxes_3d.json has",
                     where=f"{path}: {name}",
                     got=value[name],
                     expected=AXES,

@@ -262,7 +262,7 @@ def _units_of(rows: list[_Row], places: np.ndarray, units: Units, path: Path, *,
         _, sizes = shapely.STRtree(points).query_nearest(points, **near)
     seen = seen_units(places, sizes)
     if units == "auto" and seen is None:
-        what, fix = "the coordinates may be metres or degrees", "set maps.boxes.units to `m` or to `degrees`"
+        what, fix = "the coordinates fit both metres and degrees", "set maps.boxes.units to `m` or to `degrees`"
         raise InputError(what, where=path, got=f"a median size of {np.median(sizes):.3g} units", fix=fix)
     if units == "auto" and seen is not None and not (is_table and seen == "degrees"):
         return seen

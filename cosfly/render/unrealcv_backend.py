@@ -215,7 +215,7 @@ class UnrealCvRenderer(SimulatorRenderer):
             heights = zip(both.round(2).tolist(), over_m, strict=True)
             got, expected = (f"{point}, {over:.1f} m over the ground" for point, over in heights)
             what = "the camera is not at the requested position"
-            fix = "stop the level from moving the camera, such as by gravity"
+            fix = "switch off what moves the camera in the level, such as gravity or a script"
             raise RenderError(what, where=self.device, got=got, expected=expected, fix=fix)
 
     def _decoded(self, lit: str | bytes, mask: str | bytes, depth: str | bytes) -> Frame:
