@@ -1,4 +1,4 @@
-"""Templates: sentences with slots in place of facts, read once; slots.py fills them for each window.
+"""Templates: sentences with slots in place of facts, read once; formats.py fills them for each window.
 
     The gap {trend:distance} from {distance@t0} to {distance}.     a reference of verification/references.py in braces
     {decision}  {side:decision}                                    the decision in words, and its side

@@ -35,7 +35,7 @@ class Object(Record):
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Full size of the footprint, centred at its middle; on a quay without the parts over the water."""
+        """Full size of the footprint, centred at its middle; at the water without the parts over it."""
         parts = [part for part in self.parts if self.where == "open" or part[5] < LOW_PART_M]
         return (
             2 * max(abs(x) + wide / 2 for _, x, _, wide, _, _, _ in parts),
