@@ -190,6 +190,7 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "work/unlabelled/render": copy_of("runs/quickstart/render"),
     "Qwen/Qwen3.5-2B": lambda root, target: make_random_student(target),
     "models/Qwen3.5-2B": lambda root, target: make_random_student(target),
+    "work/roi_polygon.json": _shown("maps.md", '{"points_world"'),
     "work/seeing": lambda root, target: make_random_student(target),
     "models/roberta-large": lambda root, target: make_encoder(target),
     "models/bert-base-chinese": lambda root, target: make_encoder(target),

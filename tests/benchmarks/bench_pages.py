@@ -41,9 +41,9 @@ def main() -> None:
         write_boxes(root / "map.json", box_map)
         write_boxes(root / "simple.json", simplify(box_map, SimplifyConfig()).box_map)
         with browser(root / "profile") as page:
-            open_editor(root / "simple.json", PedestriansConfig(), root / "warm.json", 0, None).http.server_close()
+            open_editor(root / "simple.json", PedestriansConfig(), root / "warm.json", 0).http.server_close()
             start = time.perf_counter()
-            server = open_editor(root / "simple.json", PedestriansConfig(), root / "roi.json", 0, None)
+            server = open_editor(root / "simple.json", PedestriansConfig(), root / "roi.json", 0)
             listens_s = time.perf_counter() - start
             threading.Thread(target=server.serve, daemon=True).start()
             size = "{} x {}".format(*server.site.bare.grid.size)
