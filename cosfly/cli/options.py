@@ -241,7 +241,7 @@ def command(
             try:
                 function(job, **{name: _opened(cfg, values[name]) for name in own_names})
             except EOFError as error:  # click would print "Aborted." alone
-                raise RuntimeError("a file ends too early") from error
+                raise RuntimeError("a file or the input ends too early") from error
 
         called.__signature__ = Signature([  # type: ignore[attr-defined]
             Parameter("context", Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context),

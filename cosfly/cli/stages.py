@@ -106,7 +106,7 @@ def compare(
     from cosfly.planners.contract import ALL_PLANNERS
     from cosfly.runtime.config import build
 
-    planners = tuple(ALL_PLANNERS) if planner == ["all"] else planner
+    planners = tuple(ALL_PLANNERS) if "all" in (planner or ()) else planner
     settings = job.cfg.plan.model_dump() | ({"planners": planners} if planners else {})
     cfg = build(compare.CompareConfig, settings, "--planner")
     product = job.call("cosfly.planners.compare", cfg, map_, paths, out)

@@ -214,7 +214,7 @@ class Budget:
                 name, used = "max_cost", f"{cost:.4f} of {cfg.max_cost:g} is spent"
             if used is not None:
                 fix = "raise it and run the same command again"
-                raise BudgetSpent(f"the limit is reached: {used}", where=f"budget.{name}", fix=fix)
+                raise BudgetSpent(f"the limit is reached: {used}", where=f"caption.budget.{name}", fix=fix)
             yield
 
     def check(self, usage: Usage | None, where: str) -> None:

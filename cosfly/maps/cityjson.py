@@ -399,10 +399,11 @@ def _flattened(objects: list[CityObject]) -> list[CityObject]:
         ends = [(item.corners().min(axis=0), item.corners().max(axis=0)) for item in solids]
         samples = np.array([[*(first + last)[:2] / 2, first[2]] for first, last in ends])
     rise_m = float(np.ptp(np.percentile(samples[:, 2], RISE_SHARES)))
-    if rise_m > REPORTED_RISE_M:
-        log.warning("the ground rises by %.1f m; the map is made flat", rise_m)
     if rise_m <= FLAT_WITHIN_M:
+        if rise_m > REPORTED_RISE_M:
+            log.warning("the ground rises by %.1f m: surfaces are laid flat, buildings keep their heights", rise_m)
         return objects
+    log.warning("the ground rises by %.1f m: the map is made flat", rise_m)
     ground_m = _heights_between(samples)
     up = np.array([0.0, 0.0, 1.0])
 

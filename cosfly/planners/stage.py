@@ -176,6 +176,8 @@ def _plan_once(
     scenario = replace(scenario, reference=maneuvers.reference)
     plan = load_planner(cfg.planner)(scenario, obstacles, cfg, rng_for(seed, "plan", pedestrian.path_id))
     positions = plan.positions_m
+    if positions.shape != scenario.targets_m.shape or not np.isfinite(positions).all():
+        raise ValueError(f"the planner {cfg.planner} must return {len(scenario.targets_m)} finite positions, (n, 3)")
     if maneuvers.order is not None:
         maneuvers, positions = end_with_order(maneuvers, positions, scenario, obstacles, cfg)
     positions = np.round(positions, 4)  # as in the file, so that the metrics are those of the file

@@ -15,9 +15,11 @@ _MARKDOWN = re.compile(r"([\\`*\[\]|~#]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9]))")  #
 
 
 # What may be a key in an address: user and password, query, parameters, and a part of the path that names itself a key.
-# A name after a brace is a slot of a caption: `{change:distance@t2-t4}`.
+# A slot of a caption is no address: `{change:distance@t2-t4}`.
 # All repetitions before a fixed character are bounded, so that the time is linear in the length of a foreign text.
-_ADDRESS = re.compile(r"\b[A-Za-z][\w+.-]{0,30}://[^\s'\"<>]+|(?<!\{)\b[\w.+-]{1,100}:[^\s@/'\"<>]{1,500}@(?=\w)")
+_ADDRESS = re.compile(
+    r"\b[A-Za-z][\w+.-]{0,30}://[^\s'\"<>]+|\b(?!(?<=\{)\w+:\w+@t\d)[\w.+-]{1,100}:[^\s@/'\"<>]{1,500}@(?=\w)"
+)
 _KEYS = (
     (re.compile(r"(^|//)[^/]*(@|%40)"), r"\1***@"),
     (re.compile(r"(?i)([?;&]|%3f|%3b|%26|#(?=[^#]*=)).*"), "?***"),

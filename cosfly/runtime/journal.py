@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from cosfly.runtime.errors import InputError, plain
+from cosfly.runtime.errors import InputError, StorageError, plain
 from cosfly.runtime.io import disk_errors, open_file, read_lines, sha256_bytes, storage_errors
 from cosfly.runtime.json_io import dump_json, parse_json
 
@@ -90,6 +90,9 @@ class Journal:
         with self._lock, storage_errors(self.path):
             if self._file is None:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
+                if self.path.is_symlink():
+                    fix = "replace the link by a copy of the file, or choose another --out"
+                    raise StorageError("the journal is a link, which may lead anywhere", where=self.path, fix=fix)
                 _cut_torn_line(self.path)
                 self._file = open(self.path, "ab")  # noqa: SIM115 (kept open, closed by close())
             line_byte = self._file.tell()

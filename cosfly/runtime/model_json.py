@@ -30,7 +30,7 @@ _MARK = re.compile(
 
 DECLINED = "declined"  # finish reason: the model declines to answer, in its own words
 CONTEXT_FULL = "context_full"  # finish reason: prompt and answer fill the context, before `max_tokens`
-_NOTHING = re.compile(r"(?:\s|```\w*)*+")
+_NOTHING = re.compile(r"(?:[\s\u00ad\u200b-\u200f\u2028-\u202e\u2060-\u2064\ufeff]|```\w*)*+")
 # Finish reason -> ours, of a message that was cut off or declines to answer.
 _CUT = {"length": "cut_short", "max_tokens": "cut_short"}
 _CUT |= {name: name for name in ("content_filter", CONTEXT_FULL, DECLINED)}
@@ -145,7 +145,7 @@ class _Message:
 def _read_message(text: str) -> _Message:
     read_object = _reader()
     message = _Message()
-    position = num_broken = 0
+    position, num_broken, last_brace = 0, 0, text.rfind("}")
     while mark := _MARK.search(text, position):
         position = mark.end()
         if mark.lastgroup is not None:  # everything before is thought, or a draft
@@ -156,9 +156,10 @@ def _read_message(text: str) -> _Message:
                 position = message.objects[-1].end
             except (ValueError, RecursionError):
                 # A quoted key or a missing closing brace shows that an object was intended.
-                if _KEY.match(text, position) or text.find("}", position) < 0:
+                has_key = _KEY.match(text, position) is not None
+                if has_key or last_brace < position:
                     message.broken_at = mark.start()
-                num_broken += 1
+                num_broken += has_key  # without a key, reading ends at once
                 if num_broken > MAX_BROKEN:
                     message.broken_at = len(text)
                     break

@@ -310,7 +310,8 @@ class _Reader:
                 low_m = height_m - 0.9 * unit_m  # less than a storey lower, so that their number is the same
         if high_m is None and re.search(r"\b(?:high|tall|towers?|skyscrapers?)", self.absent):
             high_m = LOW_TOWN_M
-        if high_m is not None and not LOWEST_M <= max(low_m, LOWEST_M) <= high_m <= HIGHEST_M:
+        is_possible = max(low_m, LOWEST_M) <= (HIGHEST_M if high_m is None else high_m) <= HIGHEST_M
+        if not is_possible:
             got = " ".join(match[0].strip() for match in self.heights.values())
             expected = "a lowest height below the highest, both within 3 to 450 m"
             raise InputError("the range of building heights is impossible", where="PROMPT", got=got, expected=expected)
