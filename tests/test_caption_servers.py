@@ -465,8 +465,7 @@ def test_a_slow_answer_to_the_largest_prompt_is_no_matter_of_the_context():
     )  # fmt: skip
     assert list(findings) == ["model", "answers", "thinking", "JSON schema", "speed"]
     assert findings["speed"].state == "unusable"
-    assert "caption.endpoint.timeout_s=6" in findings["speed"].detail
-    assert re.search(r"At [\d.]+ tokens/s, as in the first answer, 1024 tokens .* take \d+ s", findings["speed"].detail)
+    assert re.search(r"timeout_s=6,.* At [\d.]+ tokens/s.* 1024 tokens .* take \d+ s", findings["speed"].detail)
 
 
 @each("defect", [{}, {"refuses_schema": True}], ids=str)  # a refused schema is a request, too

@@ -211,8 +211,9 @@ def test_a_link_is_replaced_and_what_it_points_to_is_kept(tmp_path):
     (tmp_path / "private/mine").write_text("mine")
     (tmp_path / "file").symlink_to(tmp_path / "private/mine")
     (tmp_path / "folder").symlink_to(tmp_path / "private")
-    partial = tmp_path / f".new.{os.getpid()}.partial"
-    partial.symlink_to(tmp_path / "private/mine")
+    (tmp_path / f".new.{os.getpid()}.partial").symlink_to(tmp_path / "private/mine")
+    with pytest.raises(StorageError, match="the journal is a link"):
+        Journal(tmp_path / "file").append({})
     write_bytes(tmp_path / "file", b"other")
     with store.atomic_folder(tmp_path / "folder"):
         pass
