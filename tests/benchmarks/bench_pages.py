@@ -36,7 +36,7 @@ def opened_s(page: Page, address: Path | str) -> float:
 
 def main() -> None:
     box_map = census_town("Town", 0)
-    with tempfile.TemporaryDirectory() as name:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         root = Path(name)
         write_boxes(root / "map.json", box_map)
         write_boxes(root / "simple.json", simplify(box_map, SimplifyConfig()).box_map)
