@@ -117,6 +117,7 @@ RATES = {  # stage: unit, seconds per unit, MB per unit
     "caption": ("windows", 4.0 / 804, 7.4 / 804),
     "release": ("frames", 7.8 / 790.7, 1.95),
 }
+START_S = 2.0  # of a stage and its workers, which `showcase` hides: inspect and release of `quickstart` take 2 to 4 s
 WALK_MPS = 1.0  # progress along the straight line from start to goal, with detours and stops
 PERSON_M, PERSON_DEPTH_M = 1.75, 0.45  # height of a person, and extent in the plane
 SMALL_SHARE = 0.2  # of the time
@@ -191,7 +192,7 @@ def _estimate(name: str, count: int, cfg: RunConfig, out: Path) -> StageEstimate
     unit, unit_s, unit_mb = RATES[name]
     scale = count * (cfg.render.width_px * cfg.render.height_px / 1e6 if unit == "frames" else 1)
     is_known = name != "caption" or cfg.caption.teacher_kind == "rules"
-    return StageEstimate(name, count, unit_s * scale if is_known else None, unit_mb * scale * 1e6, False)
+    return StageEstimate(name, count, START_S + unit_s * scale if is_known else None, unit_mb * scale * 1e6, False)
 
 
 def _is_complete(folder: Path) -> bool:
