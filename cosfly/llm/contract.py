@@ -4,7 +4,6 @@ An engine knows no captions, journals or budgets: it is started, answers many re
 """
 
 import asyncio
-import os
 import signal
 import threading
 from collections.abc import AsyncIterator, Coroutine
@@ -16,10 +15,6 @@ from cosfly.formats.captions import Usage
 
 Result = TypeVar("Result")
 CountName = Literal["prompt_tokens", "completion_tokens"]
-AT_ONCE = {
-    False: b"error: interrupted at once\n",
-    True: b"error: interrupted at once; recorded answers are kept; run the same command again to continue\n",
-}
 MOST_TOKENS = 10_000_000  # of one answer: longer than the context of any model
 STOP_AFTER_FAILURES = 20  # consecutive windows or samples without an answer after which a run ends
 
@@ -101,45 +96,34 @@ async def started(engine: Engine) -> AsyncIterator[None]:
         await engine.close()
 
 
-def run_until_interrupted(main: Coroutine[Any, Any, Result], *, keeps_work: bool = True) -> Result:
-    """Run a coroutine as `asyncio.run` does: Ctrl-C or SIGTERM cancels its tasks in order, a second ends the process.
+def run_until_interrupted(main: Coroutine[Any, Any, Result]) -> Result:
+    """Run a coroutine as `asyncio.run` does, and let SIGTERM cancel its tasks in order, as Ctrl-C does.
 
-    After the first one it raises KeyboardInterrupt, or SystemExit as the command line does, when all tasks have ended.
-    Otherwise each cancelled task would print a traceback. Journals survive an end at any time.
-
-    Args:
-        keeps_work: Whether answers are recorded, for the message.
+    It then raises SystemExit, as the command line does. Otherwise each cancelled task would print a traceback. Journals
+    survive an end at any time.
     """
     if threading.current_thread() is not threading.main_thread():
         return asyncio.run(main)
-    received: signal.Signals | None = None
-    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    is_terminated = False
+    previous = signal.getsignal(signal.SIGTERM)
 
     async def guarded() -> Result:
         task = asyncio.current_task()
         assert task is not None
 
-        def interrupt(number: signal.Signals) -> None:
-            nonlocal received
-            if received is not None:
-                os.write(2, AT_ONCE[keeps_work])
-                os._exit(128 + number)
-            received = number
+        def terminate() -> None:
+            nonlocal is_terminated
+            is_terminated = True
             task.cancel()
 
-        for number in previous:
-            asyncio.get_running_loop().add_signal_handler(number, interrupt, number)
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, terminate)
         return await main
 
     try:
-        result = asyncio.run(guarded())
+        return asyncio.run(guarded())
     except asyncio.CancelledError:
-        if received is None:
-            raise
+        if is_terminated:
+            raise SystemExit(128 + signal.SIGTERM) from None
+        raise
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-    if received is None:
-        return result
-    # A signal may also come after the end of all tasks, while the loop waits for its threads.
-    raise KeyboardInterrupt if received == signal.SIGINT else SystemExit(128 + received)
+        signal.signal(signal.SIGTERM, previous)
