@@ -17,7 +17,6 @@ PLAN_FORMAT = FileFormat("cosfly.world_plan", "2", "plan of a world")
 VERGE_M = 10.0  # of lawn around the town
 PATH_M = 4.0  # width of a footpath
 LEAST_INSIDE_M = 30.0  # side of a town without its edges, its river and its widest street
-LOW_PART_M = 3.0  # parts of a quay that begin above this height are over the water
 
 
 class Object(Record):
@@ -28,18 +27,17 @@ class Object(Record):
 
     name: str
     parts: tuple[tuple[str, float, float, float, float, float, float], ...] = ()
-    where: Literal["open", "quay", "water", "layout"] = "open"
+    where: Literal["open", "water", "layout"] = "open"
     words: tuple[str, ...] = ()
     asset: str | None = None
     least_scale: float = 1.0
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Full size of the footprint, centred at its middle; at the water without the parts over it."""
-        parts = [part for part in self.parts if self.where == "open" or part[5] < LOW_PART_M]
+        """Full size of the footprint, centred at its middle."""
         return (
-            2 * max(abs(x) + wide / 2 for _, x, _, wide, _, _, _ in parts),
-            2 * max(abs(y) + deep / 2 for _, _, y, _, deep, _, _ in parts),
+            2 * max(abs(x) + wide / 2 for _, x, _, wide, _, _, _ in self.parts),
+            2 * max(abs(y) + deep / 2 for _, _, y, _, deep, _, _ in self.parts),
         )
 
 
@@ -89,7 +87,7 @@ class WorldPlan(BaseModel):
     pattern: Literal["grid", "radial", "organic", "linear", "campus"] = Field(
         "grid",
         description="streets: grid; radial (avenues from a middle, rings); organic (winding); linear (one long road, "
-        "along a river or shore if there is one); campus (a ring road, footpaths over lawns)",
+        "along a river if there is one); campus (a ring road, footpaths over lawns)",
     )
     size_m: Range | None = Field(
         None, description="the town from west to east and from south to north, 80 to 2000; null: as its blocks need"
@@ -98,14 +96,12 @@ class WorldPlan(BaseModel):
     block_m: float = Field(60.0, ge=30.0, le=180.0, description="mean side of a block")
     street_m: float = Field(16.0, ge=5.0, le=40.0, description="streets, from front to front; below 9 without cars")
     avenue_m: float = Field(24.0, ge=5.0, le=60.0, description="main streets, from front to front")
-    spokes: int = Field(0, ge=0, le=16, description="avenues of a radial town; 0: 5 to 8")
     unevenness: float = Field(0.1, ge=0.0, le=0.3, description="how much the sides of blocks differ")
     buildings: list[Buildings] = Field([], max_length=12, description="kinds of buildings that the user names")
     only_these: bool = Field(False, description="there are no buildings but those of `buildings` and `objects`")
     footprint_m: Range = Field((12.0, 30.0), description="sides of other buildings")
     heights_m: Range = Field((8.0, 24.0), description="heights of other buildings")
     highest_m: float | None = Field(None, ge=3.0, le=450.0, description="no building is higher; null: no limit")
-    high_center: bool = Field(False, description="the highest buildings stand in the middle")
     building_share: Range = Field((0.0, 0.8), description="ground that buildings cover, of the town without water")
     gap_m: float = Field(3.0, ge=0.5, le=40.0, description="between neighbouring buildings")
     setback_m: float = Field(1.0, ge=0.0, le=15.0, description="from pavement to front; from 2.5 on there are gardens")
@@ -114,7 +110,6 @@ class WorldPlan(BaseModel):
     greens: int = Field(1, ge=0, le=40, description="blocks that are lawn with trees")
     river_m: float = Field(0.0, ge=0.0, le=100.0, description="width of a river; 0: none")
     bridges: int = Field(0, ge=0, le=10, description="bridges over the river; 0: one to four")
-    shore_m: float = Field(0.0, ge=0.0, le=300.0, description="open water at the south edge; 0: none")
     parked_share: float = Field(0.25, ge=0.0, le=1.0, description="share of parking places that are taken")
     objects: list[NamedObject] = Field([], max_length=40, description="what the prompt names, each once")
     not_used: list[str] = Field([], max_length=200, description="words of the prompt that no other field holds")

@@ -41,8 +41,6 @@ _HEIGHT = (  # "12 m", "3-storey", but not the "12 m" of "12 m wide"
     rf"(?P<number>{_NUMBER})[ -]?(?P<unit>m|metres?|meters?|floors?|storeys?|stor(?:y|ies)|levels?)\b"
     r"(?! (?:wide|long|x|by))(?: high| tall| in height)?"
 )
-_STREET = r"\b(?P<street>street|road|lane|alley|avenue)s?"
-_WIDTH = rf"(?P<number>{_NUMBER}) ?(?P<unit>{_LENGTH})"
 _HEIGHTS = {
     # "no building is higher than 20 m", "up to 3 floors"
     "at_most": r"(?:(?:no|none|not|nothing)(?: \w+)?(?: is| are)? (?:higher|taller|more|over|above)(?: than)?|under"
@@ -59,10 +57,6 @@ _SIZES = {
     # "2.5 sq km"
     "area": rf"{_NUMBER} ?(km2|km²|square kilomet(?:er|re)s?|sq\.? ?km|hectares?|ha|m2|m²|square met(?:er|re)s)(?!\w)",
     "length": rf"{_NUMBER} ?{_LENGTH} long\b",  # "800 m long"
-}
-_WIDTHS = {
-    "after": rf"{_STREET}(?: (?:width|are|is|of))* {_WIDTH}(?: wide| in width)?",  # "lanes are 5 m wide"
-    "before": rf"{_WIDTH}[- ]wide {_STREET}",  # "20 m wide avenues"
 }
 _STREETS = r"\b(\d+) ([a-z-]+ )?(avenue|boulevard|spoke|street|road)s?\b"  # "6 broad avenues"
 _ABSENT = r"\b(?:no|without(?: any)?)\s+((?:(?! (?:but|and|with) )[^.,;:()])+)"  # "without any towers"
@@ -123,8 +117,7 @@ class _Reader:
         for name, low, high in (("blocks_along", 0.92, 1.08), ("block_m", 0.85, 1.2), ("gap_m", 0.92, 1.08)):
             self.plan[name] = _scaled(self.plan[name], rng_for(seed, "world", name).uniform(low, high))
         self._set_heights()
-        self._set_widths()
-        self._set_size_and_avenues()
+        self._set_size()
         if re.search(r"\b(?:vehicles?|traffic)\b", self.absent):
             self.plan["parked_share"] = 0.0
         for name, (low, high) in FIELD_BOUNDS.items():
@@ -175,9 +168,10 @@ class _Reader:
 
     def _take_phrases(self) -> None:
         """Take measures and nouns. Each is taken before those that would misread it."""
-        # Measures are before nouns, which their numbers do not count. Heights are last, because a width looks like one.
+        # Measures are before nouns, which their numbers do not count.
         self.sizes = {name: match for name, pattern in _SIZES.items() if (match := self._take(pattern))}
-        self.widths = {name: match for name, pattern in _WIDTHS.items() if (match := self._take(pattern))}
+        while match := self._take(rf"{_NUMBER} ?{_LENGTH}[- ]wide\b"):  # before the word "wide"
+            self.not_used.append(match[0].strip())
         self.streets = self._take(_STREETS, keep=r", \2 \3 ,")
         self.heights = {name: match for name, pattern in _HEIGHTS.items() if (match := self._take(pattern))}
         for name in [name for name in self.heights if name != "at_least"][1:]:  # highest ones after the first
@@ -256,9 +250,8 @@ class _Reader:
         if "bridge" in self.objects:
             self.plan["bridges"] = self._within("number of bridges", self.objects["bridge"], 1, 10)
             self.plan["river_m"] = self.plan["river_m"] or WORDS["water"]["river"][1]
-        places = {OBJECTS[name].where for name in self.objects}
-        if "quay" in places or ("water" in places and not self.plan["river_m"]):
-            self.plan["shore_m"] = self.plan["shore_m"] or WORDS["water"]["harbour"][1]
+        if any(OBJECTS[name].where == "water" for name in self.objects):
+            self.plan["river_m"] = self.plan["river_m"] or WORDS["water"]["harbour"][1]
         return has_open
 
     def _left_over(self) -> list[str]:
@@ -322,24 +315,9 @@ class _Reader:
         self.plan["highest_m"] = None if is_of_a_kind else high_m  # "houses of up to 3 floors" limit no lighthouse
         for group in (self.plan, *self.plan["buildings"]):
             group["heights_m"] = _limited(group["heights_m"], low_m, high_m, is_replaced="between" in self.heights)
-        if re.search(r"\b(?:towers|high-rises|skyscrapers) in the (?:cent|middle)", self.prompt.lower()):
-            self.plan["high_center"] = True
-            # The heights rise towards the middle, so that they begin low.
-            self.plan["heights_m"] = (min(self.plan["heights_m"][0], 8.0), self.plan["heights_m"][1])
 
-    def _set_widths(self) -> None:
-        """Set the widths of streets to those of the prompt."""
-        for match in self.widths.values():
-            field = "avenue_m" if match["street"] == "avenue" else "street_m"
-            width_m = float(match["number"]) * _metres(match["unit"])
-            width_m = self._within(f"{match['street']} width, m", width_m, *FIELD_BOUNDS[field])
-            if field == "street_m":  # avenues stay as many times wider; a linear town has one width
-                ratio = 1.0 if self.plan["pattern"] == "linear" else self.plan["avenue_m"] / self.plan["street_m"]
-                self.plan["avenue_m"] = width_m * ratio
-            self.plan[field] = width_m
-
-    def _set_size_and_avenues(self) -> None:
-        """Set the size of the town and the number of its avenues to those of the prompt."""
+    def _set_size(self) -> None:
+        """Set the size of the town to that of the prompt."""
         pitch_m = self.plan["block_m"] + self.plan["street_m"]
         for name, match in self.sizes.items():
             if name == "sides":
@@ -355,13 +333,8 @@ class _Reader:
             self.plan["size_m"] = tuple(self._within("size of the town, m", side_m, 80.0, 2000.0) for side_m in sides_m)
             most_m = min(self.plan["size_m"]) / 4  # so that blocks remain
             self.plan["river_m"] = min(self.plan["river_m"], most_m / 2)
-            for field in ("street_m", "avenue_m"):
-                if self.plan[field] > most_m and self.widths:
-                    self.not_respected.append(f"street width in so small a town: {most_m:g} m is possible")
-                self.plan[field] = min(self.plan[field], most_m)
-        if self.streets and self.plan["pattern"] == "radial":
-            self.plan["spokes"] = self._within(f"number of {self.streets[3]}s", int(self.streets[1]), 3, 16)
-        elif self.streets and self.streets[1] != "1":  # other patterns have no number of streets
+            self.plan |= {field: min(self.plan[field], most_m) for field in ("street_m", "avenue_m")}
+        if self.streets and self.streets[1] != "1":  # no pattern has a number of streets
             self.not_used.append(f"{self.streets[1]} {self.streets[3]}s")
 
     def _within(self, what: str, value: Any, low: Any, high: Any) -> Any:

@@ -23,7 +23,6 @@ from cosfly.worldgen.plan import PATH_M, VERGE_M, Range, WorldPlan
 
 LANE_M = 9.0  # narrower streets have no carriageway
 WIDE_M = 26.0  # wider streets have wide pavements
-QUAY_M = 10.0  # between the promenade and the open water
 PARALLEL_M = 16.0  # a street that is nearer to a bank or to the promenade all along is dropped
 GRID_M = 0.05  # of the ends of streets
 
@@ -111,7 +110,7 @@ def grid(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Line]
 def radial(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Line]:
     """Return avenues that meet at a ring around the middle, and streets on rings between them."""
     half = np.array(size_m) / 2
-    count = plan.spokes or int(rng.integers(5, 9))
+    count = int(rng.integers(5, 9))
     steps = 1.0 + 0.35 * plan.unevenness * rng.uniform(-1, 1, count)
     angles = rng.uniform(0, 2 * math.pi) + np.cumsum(steps / steps.sum()) * 2 * math.pi
     inner = max(plan.block_m / 2, count * (plan.avenue_m + 6.0) / (2 * math.pi)) / half.min()
@@ -173,22 +172,18 @@ def winding(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Li
 
 
 def linear(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Line]:
-    """Return one long road with short streets to its sides; a river or a shore brings its own roads."""
+    """Return one long road with short streets to its sides; a river brings its own roads."""
     width, depth = size_m
     pitch_m = plan.block_m + plan.street_m
     x = _spaced(width, 1.4 * pitch_m, 0.2, rng)
-    has_water = bool(plan.river_m or plan.shore_m)
-    sway = 0.0 if has_water else min(0.12 * depth, 0.25 * pitch_m)
+    sway = 0.0 if plan.river_m else min(0.12 * depth, 0.25 * pitch_m)
     main = np.stack([x, sway * rng.uniform(-1.0, 1.0, len(x))], axis=1)
-    main[:, 1] -= depth / 2 if plan.shore_m else 0.0  # under the water
-    lines = [] if has_water else [Line(main, plan.avenue_m)]
+    lines = [] if plan.river_m else [Line(main, plan.avenue_m)]
     side = 1.0 if rng.random() < 0.5 else -1.0
     for number, (a, b) in enumerate(pairwise(main)):
         foot = a + (b - a) * rng.uniform(0.35, 0.65)
-        both = (1.0, -1.0) if plan.river_m or number % 3 == 2 else (side,)
-        for way in (1.0,) if plan.shore_m else both:
-            reach_m = pitch_m * rng.uniform(0.9, 1.3)
-            reach_m = min(depth, 2.5 * reach_m) if plan.shore_m else min(depth / 2, reach_m)
+        for way in (1.0, -1.0) if plan.river_m or number % 3 == 2 else (side,):
+            reach_m = min(depth / 2, pitch_m * rng.uniform(0.9, 1.3))
             tip = foot + np.array([rng.uniform(-0.2, 0.2) * reach_m, way * reach_m])
             lines.append(Line(np.stack([foot, tip]), plan.street_m))
         side = -side
@@ -203,18 +198,12 @@ PATTERNS: dict[str, Callable[[WorldPlan, Range, np.random.Generator], list[Line]
 def network(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> Network:
     """Return the streets and the water of a town of a size."""
     margin_m = VERGE_M + max(plan.avenue_m, plan.street_m) / 2
-    below_m = plan.block_m + plan.street_m if plan.shore_m else 0.0  # of the pattern, under the water
     half_x, half_y = size_m[0] / 2, size_m[1] / 2
-    inner = size_m[0] - 2 * margin_m, size_m[1] - 2 * margin_m + below_m
-    shift = np.array([0.0, -below_m / 2])
-    lines = [Line(line.points + shift, line.width_m) for line in PATTERNS[plan.pattern](plan, inner, rng)]
+    inner = size_m[0] - 2 * margin_m, size_m[1] - 2 * margin_m
+    lines = PATTERNS[plan.pattern](plan, inner, rng)
     window = shapely.box(margin_m - half_x, -half_y, half_x - margin_m, half_y)
     water: BaseGeometry = Polygon()
     bridges: list[Line] = []
-    if plan.shore_m:
-        shore = LineString([(x, -half_y - plan.shore_m / 2) for x in (-half_x, half_x)])
-        lines, _ = _with_banks(lines, shore, plan.shore_m / 2 + QUAY_M + plan.avenue_m / 2, plan.avenue_m, window)
-        water = shapely.buffer(shore, plan.shore_m / 2, cap_style="flat")
     if plan.river_m:
         x = np.linspace(-half_x, half_x, 6)
         sway = min(0.08 * size_m[1], 12.0) * rng.uniform(-1.0, 1.0, len(x))

@@ -26,7 +26,7 @@ from cosfly.maps.footprints import Rectangle, footprints, oriented_rectangle, po
 from cosfly.runtime.seeding import rng_for
 from cosfly.simulators.assets import ASSETS
 from cosfly.worldgen.plan import VERGE_M, Buildings, Object, Range, WorldPlan, assets
-from cosfly.worldgen.streets import GROUND_TOP_M, QUAY_M, lay_streets, network, pave
+from cosfly.worldgen.streets import GROUND_TOP_M, lay_streets, network, pave
 
 CM_PER_M = 100.0
 ROAD_PIECE_M = 200.0  # length of SimWorld's piece of road
@@ -99,7 +99,7 @@ def _stretched(plan: WorldPlan, side_m: float, seed: int) -> Range:
     """Return the sides of a town of about side_m**2; linear towns are long."""
     rng = rng_for(seed, "world", "ratio")
     ratio = rng.uniform(1.0, 1.25) * (1.7 if plan.pattern == "linear" else 1.0)
-    is_wide = plan.pattern == "linear" or plan.shore_m or plan.river_m or rng.random() < 0.5
+    is_wide = plan.pattern == "linear" or plan.river_m or rng.random() < 0.5
     width, height = side_m * math.sqrt(ratio), side_m / math.sqrt(ratio)
     return (width, height) if is_wide else (height, width)
 
@@ -161,12 +161,7 @@ class Town:
         self._strips = lay_streets(boxes, self.network, plan.parked_share, furniture)
         self._paved = shapely.STRtree(self._strips)  # where paths to doors begin
         strips = shapely.union_all(self._strips)
-        south = -y
-        if plan.shore_m:
-            south += QUAY_M
-            pave(boxes, shapely.difference(shapely.box(-x, -y, x, south), strips))
-            boxes.span("Walls", (-x, -y), (x, -y + 0.2), -1.2, 0.4)
-        ground = shapely.box(-x, south, x, y)
+        ground = shapely.box(-x, -y, x, y)
         self._blocks = shapely.difference(ground, shapely.union(strips, self.network.water))
         self._closed = [
             block for block in polygons_of(self._blocks)
@@ -174,7 +169,7 @@ class Town:
         ]  # fmt: skip
         self._closed.sort(key=lambda block: block.centroid.distance(shapely.Point(0, 0)))
         inside = shapely.union_all(self._closed) if plan.pattern == "campus" else self._blocks
-        self._buildable = shapely.intersection(inside, shapely.box(2.0 - x, south, x - 2.0, y - 2.0))
+        self._buildable = shapely.intersection(inside, shapely.box(2.0 - x, -y, x - 2.0, y - 2.0))
 
     def _open_blocks(self) -> None:
         """Choose plazas, the nearest to the middle, and greens; pave plazas, and paths across greens."""
@@ -248,8 +243,7 @@ class Town:
     def _build_house(self, lot: Rectangle, kind: Buildings, rng: np.random.Generator) -> None:
         """Build one house on a lot, and the path to its door."""
         low, high = kind.heights_m
-        fall = min(1.0, math.hypot(*lot.center) / (0.5 * min(self.size_m))) if self.plan.high_center else 0.0
-        height = low + (high - low) * rng.beta(1.3, 1.7) * (1.0 - 0.9 * fall)
+        height = low + (high - low) * rng.beta(1.3, 1.7)
         self._boxes.add("Buildings", lot.center, lot.size, 0.0, height, lot.yaw_deg)
         self._add_path(self._boxes, lot)
         self._taken.append(rectangle_polygon(lot))
@@ -265,7 +259,7 @@ class Town:
             path.lay("Sidewalks", (-0.25, -DOOR_M / 2), (line.length + 0.25, DOOR_M / 2))
 
     def _place_object(self, thing: Object, count: int) -> None:
-        """Place an object `count` times: in open blocks, at a street, on the quay or in the water."""
+        """Place an object `count` times: in open blocks, at a street or in the water."""
         if thing.where == "layout":
             num_built = min(count, len(self.network.bridges))
             self.placed += [Placed(thing.name, number, (0.0, 0.0), 0.0, 1.0) for number in range(num_built)]
@@ -289,13 +283,9 @@ class Town:
 
     def _find_place(self, thing: Object, scales: list[float]) -> tuple[Rectangle, float] | None:
         """Return the outline and the scale of an object where there is room, else None."""
-        x, y = self.size_m[0] / 2, self.size_m[1] / 2
         areas: list[tuple[BaseGeometry, float]] = []
         if thing.where == "open":
             areas = [(block, oriented_rectangle(block).yaw_deg) for block in self.open_blocks]
-        elif self.plan.shore_m:
-            low, high = (-0.5, QUAY_M - 0.5) if thing.where == "quay" else (-self.plan.shore_m, 0.0)
-            areas = [(shapely.box(2 - x, low - y, x - 2, high - y), 0.0)]
         elif thing.where == "water":
             over = [one.rectangle((0.0, one.length_m), (-one.width_m, one.width_m)) for one in self.network.bridges]
             bridges = shapely.union_all([rectangle_polygon(one) for one in over])
@@ -313,7 +303,7 @@ class Town:
     def _place_in(
         self, thing: Object, area: BaseGeometry, scales: list[float], yaw_deg: float
     ) -> tuple[Rectangle, float] | None:
-        """Return a place of an object in an area, along its yaw or across: at the quay's edge, else near the middle."""
+        """Return a place of an object in an area, along its yaw or across, near the middle."""
         turned = rotate(area, -yaw_deg, origin=(0, 0))
         near = [outline for outline in self._taken if outline.distance(area) < SPACE_M]
         tree = shapely.STRtree([rotate(outline, -yaw_deg, origin=(0, 0)) for outline in near])
@@ -321,14 +311,11 @@ class Town:
         low_x, low_y, high_x, high_y = turned.bounds
         x, y = np.meshgrid(np.arange(low_x, high_x, STEP_M), np.arange(low_y, high_y, STEP_M))
         centers = np.stack([x.ravel(), y.ravel()], axis=1)
-        by_water = thing.where != "open"
-        if by_water and self.plan.shore_m:
-            centers[:, 1] = high_y - thing.size_m[1] / 2 - 0.3
         away_m = np.hypot(*(centers - np.array(turned.centroid.coords[0])).T)
         x, y = centers[np.argsort(away_m, kind="stable")].T
         for scale in scales:
             wide, deep = (side * scale for side in thing.size_m)
-            for turn_deg in (0.0,) if by_water else (0.0, 90.0):
+            for turn_deg in (0.0, 90.0) if thing.where == "open" else (0.0,):
                 half_x, half_y = (wide / 2, deep / 2) if turn_deg == 0 else (deep / 2, wide / 2)
                 outlines = shapely.box(x - half_x, y - half_y, x + half_x, y + half_y)
                 for outline in outlines[shapely.contains_properly(turned, outlines)]:
