@@ -24,7 +24,7 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.student_chat import read_chat_format, write_chat_format
 from cosfly.runtime.errors import NothingKept
-from distill.inference.stage import Completion
+from distill.inference.answers import Completion
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split
 from distill.student.random_student import make_random_student
@@ -214,7 +214,7 @@ def test_a_student_can_answer_with_its_decision_alone(town, tmp_path, in_this_pr
         assert stop == '",'
         return [Completion(next(texts), 9, True) for _ in rows]
 
-    monkeypatch.setattr("distill.inference.stage.generate", answers)
+    monkeypatch.setattr("distill.inference.answers.generate", answers)
     flown = fly(town, tmp_path / "flown", f"{SHORT} {few} --student transformers:{student}")
     found = {(frame.answer, frame.action) for record in flown.values() for frame in record.decisions}
     assert found == {("ok", "move_forward"), ("unreadable", None), ("invalid", None)}

@@ -37,7 +37,8 @@ from cosfly.render.stage import run as render
 from cosfly.runtime.errors import InputError
 from cosfly.viz.gallery import four_panels
 from cosfly.viz.viewer import run
-from distill.inference.stage import EngineAnswers, InferConfig, Inputs
+from distill.inference.answers import EngineAnswers
+from distill.inference.samples import InferConfig, Inputs
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample
 from specimens import make_playback_tree

@@ -19,7 +19,7 @@ from distill.evaluation import figures
 from distill.evaluation.figures import Answers, coc_of, measure, text_of
 from distill.evaluation.report import REPORT_FORMAT, Evaluation, notes_of, tables_of
 from distill.evaluation.stage import Scorer, asked_samples, floors_of, majority, run
-from distill.inference.stage import make_prediction
+from distill.inference.samples import make_prediction
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split
 
@@ -360,7 +360,6 @@ def test_an_evaluation_with_an_encoder_names_it(place, encoder):
     assert f1["silent"] == 0
     assert f1["teacher"] is None
     assert report.languages["en"].who["majority"].figures["values_matched"].value is None
-    assert sum(report.languages["en"].histograms["one"]) == 6  # of parsed answers
     rows = [row[0] for row in tables_of(report, "en")[0].rows]
     assert f"BERTScore F1 ({encoder.parent.name}/encoder layer 3)" in rows
 

@@ -91,7 +91,7 @@ def test_one_sample_without_an_answer_costs_no_other(place, tmp_path):
 
 
 def test_nothing_answered_is_asked_twice(place, tmp_path, monkeypatch):
-    monkeypatch.setattr("distill.inference.stage.STOP_AFTER_FAILURES", 2)
+    monkeypatch.setattr("distill.inference.answers.STOP_AFTER_FAILURES", 2)
     out = tmp_path / "out"
     cfg = settings()
     with TeacherServer(lambda number, body: "500" if number >= 5 else None) as server:

@@ -16,7 +16,7 @@ from cosfly.llm.student_chat import CHAT_FORMAT_FILE
 from cosfly.runtime.errors import ConfigError
 from distill.inference import merge
 from distill.inference import stage as infer
-from distill.inference.stage import generate
+from distill.inference.answers import generate
 from distill.schema import Sample, open_split, resolve_trees
 from distill.student.model import load_student
 from distill.student.random_student import make_random_student

@@ -39,7 +39,8 @@ from cosfly.llm.student_chat import CHAT_FORMAT_FILE, read_chat_format
 from cosfly.runtime.errors import ConfigError, CosflyError
 from cosfly.runtime.model_json import find_object
 from cosfly.runtime.seeding import rng_for
-from distill.inference.stage import InferConfig, Inputs, LocalAnswers
+from distill.inference.answers import LocalAnswers
+from distill.inference.samples import InferConfig, Inputs
 from distill.schema import Sample
 
 DECISION_END = '",'  # behind a decision that is the first field of an answer

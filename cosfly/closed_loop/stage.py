@@ -49,7 +49,7 @@ from cosfly.runtime.limits import num_cpus
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.runtime.worker import Item, Outcome, Work, advance
-from distill.inference.stage import InferConfig
+from distill.inference.samples import InferConfig
 
 log = logging.getLogger(__name__)
 

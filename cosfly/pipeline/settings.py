@@ -23,7 +23,7 @@ from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import SimplifyConfig
 from cosfly.worldgen.stage import WorldConfig
-from distill.inference.stage import InferConfig
+from distill.inference.samples import InferConfig
 from distill.prepare.dual_track import DualTrackConfig
 from distill.prepare.stage import PrepareConfig
 from distill.training.settings import TrainConfig

@@ -22,7 +22,6 @@ from distill.schema import Sample
 
 CONFIDENCE = 0.95  # level of the intervals
 RESAMPLES = 2000  # draws of pedestrian trajectories
-BINS = 50  # of the histogram of F1, from 0 to 1
 UNPARSED = -1  # the number of the decision of an answer that does not parse
 UNPARSED_NAME = "(unparsed)"
 TEACHER = "teacher"
@@ -66,16 +65,12 @@ class Pairing(Record):
 
 
 class Measurement(Record):
-    """Figures on the samples of one language. who: students, teacher, baselines.
-
-    histograms: student -> number of parsed answers by F1, in BINS equal bins from 0 to 1.
-    """
+    """Figures on the samples of one language. who: students, teacher, baselines."""
 
     samples: int
     walks: int
     who: dict[str, FigureSet]
     pairings: list[Pairing]
-    histograms: dict[str, list[int]]
 
 
 def coc_of(sample: Sample) -> Coc:
@@ -205,7 +200,8 @@ def measure(
     def figure(name: str, drawn: np.ndarray, count: float) -> Figure:
         return figure_of_draws(float(drawn[0]), drawn[1:], int(count), len(names), CONFIDENCE)
 
-    who, histograms, pairings = {}, {}, []
+    who = {}
+    pairings = []
     for name, own in values.items():
         counts = {key: pair[1].sum() for key, pair in ratios[name].items()}
         counts["macro_f1"] = counts["accuracy"]
@@ -214,14 +210,11 @@ def measure(
         by_decision = {token: one for token, one in found.items() if one.count}
         confusion = _confusion(samples, everyone[name]) if name in students else {}
         who[name] = FigureSet(figures=figures, by_decision=by_decision, confusion=confusion)
-        f1 = everyone[name].scores[everyone[name].decision != UNPARSED, 2]
-        if name in students and not np.isnan(f1).all():
-            histograms[name] = np.histogram(np.clip(f1[~np.isnan(f1)], 0, 1), bins=BINS, range=(0, 1))[0].tolist()
     for first, second in combinations(students, 2):
         differences = {key: values[first][key] - values[second][key] for key in FIGURES}
         found = {key: figure(key, drawn, len(samples)) for key, drawn in differences.items()}
         pairings.append(Pairing(first=first, second=second, differences=found))
-    return Measurement(samples=len(samples), walks=len(names), who=who, pairings=pairings, histograms=histograms)
+    return Measurement(samples=len(samples), walks=len(names), who=who, pairings=pairings)
 
 
 def _confusion(samples: Sequence[Sample], answers: Answers) -> dict[str, dict[str, int]]:

@@ -10,7 +10,6 @@ from cosfly.viz.page import page
 from cosfly.viz.tables import TextTable
 from distill.evaluation.figures import (
     BERTSCORE,
-    BINS,
     CONFIDENCE,
     FIGURES,
     RESAMPLES,
@@ -20,7 +19,7 @@ from distill.evaluation.figures import (
     Measurement,
 )
 
-REPORT, REPORT_FORMAT = "report.json", FileFormat("cosfly.distill_report", "4.0", "report")
+REPORT, REPORT_FORMAT = "report.json", FileFormat("cosfly.distill_report", "5.0", "report")
 LANGUAGES: dict[Language, str] = {"en": "English", "zh": "Chinese"}
 # The paper's students: tab:distillation_summary, and the accuracies in the text of
 # sec:appendix_f_caption_distillation.
@@ -170,10 +169,9 @@ def page_of(report: Evaluation) -> str:
     parts = []
     for language, part in report.languages.items():
         main, *tables = tables_of(report, language)
-        parts.append({"main": main, "tables": tables, "plots": [*_confusions(report, part), *_histograms(part)]})
+        parts.append({"main": main, "tables": tables, "plots": _confusions(report, part)})
     look = {
         "shown": lambda cell: f"{cell:.0%}" if isinstance(cell, float) else str(cell),
-        "numeric_columns": lambda table: table["numeric"],
         "greatest": lambda table: table["most"],
     }
     return page(
@@ -195,19 +193,6 @@ def _confusions(report: Evaluation, part: Measurement) -> list[dict[str, Any]]:
             rows.append([f"{token} ({total})", *(row.get(answer, 0) / total for answer in answers)])
         plots.append({
             "title": f"{name}: the teacher's decision (rows) against the answer", "head": ["", *answers], "rows": rows,
-            "plot": "heat", "most": 1.0,
-        })  # fmt: skip
-    return plots
-
-
-def _histograms(part: Measurement) -> list[dict[str, Any]]:
-    """Return the distribution of the F1 of each student's parsed answers, without the empty bins at either end."""
-    plots = []
-    for name, counts in part.histograms.items():
-        filled = [k for k, count in enumerate(counts) if count]
-        rows = [[f"{k / BINS:.2f}", counts[k]] for k in range(filled[0], filled[-1] + 1)]
-        plots.append({
-            "title": f"{name}: BERTScore F1 of parsed answers", "head": ["from", "answers"], "rows": rows,
-            "plot": "bars", "most": max(counts), "numeric": [False, True],
+            "most": 1.0,
         })  # fmt: skip
     return plots

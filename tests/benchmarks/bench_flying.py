@@ -27,7 +27,7 @@ from cosfly.planners.contract import PlanConfig
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.run_dir import read_manifest
 from cosfly.simplify.passes import SimplifyConfig, simplify
-from distill.inference.stage import InferConfig
+from distill.inference.samples import InferConfig
 
 SEED = 64
 
