@@ -12,6 +12,7 @@ of the same quantity and frames it is written without its sign. A word takes the
 import re
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
+from typing import NamedTuple
 
 from caption.verification.glossary import form_after, is_negated, spellings, written_unit
 from caption.verification.references import (
@@ -32,7 +33,7 @@ SLOT_MARK = "\ufffc"  # replaces a slot in the text without slots
 _BRACES = re.compile(r"\{([^{}]*)\}")
 _ARTICLE = re.compile(r"\b([Aa])n?\s+$")
 _VERBS = ("target_motion", "drone_motion", "walking")
-_ALIASES = {
+_ALIASES = {  # what prompts call a slot -> its reference; "compared" is the comparison seen from the target
     "compare:drone_speed,target_speed": "comparison:speed",
     "compare:target_speed,drone_speed": "compared:speed",
     "side:target": "side:offset_x",
@@ -92,24 +93,27 @@ def read_sentence(text: str, language: Language, num_frames: int) -> Sentence:
     texts, names = parts[::2], parts[1::2]
     if any("{" in part or "}" in part for part in texts):
         raise InvalidSlot("a brace is not closed or not opened")
-    slots: list[Slot] = []
+    slots = list[Slot]()
     for number, written in enumerate(names):
         before, after = "".join(texts[: number + 1]), texts[number + 1]
-        slot = read_slot(written, texts[number], after, language)
         if is_negated(before.lower(), len(before), language):
             raise InvalidSlot(f"{{{written}}}: a slot is a fact and always true: do not negate it")
+        slot = read_slot(written, texts[number], after, language)
         texts[number + 1] = _without_repetition(slot, after, language)
         slots.append(slot)
-    outside = SLOT_MARK.join(texts)
-    paired = _paired(slots, num_frames)
+    slots = _paired(slots, num_frames)
+    outside = SLOT_MARK.join(texts)  # with the spaces and articles that the writer chose
     if language == "zh":  # a space before a number, none behind its unit
         texts[1:] = [re.sub(r"^ +(?=[\u4e00-\u9fff])", "", part) for part in texts[1:]]
     else:
-        paired = [_with_article(slot, texts, number) for number, slot in enumerate(paired)]
+        for number, slot in enumerate(slots):
+            if match := _ARTICLE.search(texts[number]):
+                texts[number] = texts[number][: match.start()]
+                slots[number] = replace(slot, article=match[1])
     return Sentence(
         pattern="%s".join(part.replace("%", "%%") for part in texts),
         outside=outside,
-        slots=tuple(paired),
+        slots=tuple(slots),
         names=tuple(sorted(slot.name for slot in slots)),
         is_in_script=is_in_script(outside, language),
         num_values=sum(slot.reference is not None for slot in slots),
@@ -137,16 +141,15 @@ def read_slot(written: str, before: str, after: str, language: Language) -> Slot
     return Slot(str(reference), reference, form, aspect == "side" and _needs_side(before, after, language))
 
 
-def _with_article(slot: Slot, texts: list[str], number: int) -> Slot:
-    """Move an article before a slot from its text into the slot."""
-    match = _ARTICLE.search(texts[number])
-    if match is None:
-        return slot
-    texts[number] = texts[number][: match.start()]
-    return replace(slot, article=match[1])
-
-
 # --- numbers and words of one direction -------------------------------------------------------------------------------
+
+
+class Direction(NamedTuple):
+    """What a word states or the sign of a number means, and the frames of which: `{yaw@t2}` is side:yaw of 0 to 2."""
+
+    name: str
+    first: int
+    last: int
 
 
 def _paired(slots: list[Slot], num_frames: int) -> list[Slot]:
@@ -155,46 +158,49 @@ def _paired(slots: list[Slot], num_frames: int) -> list[Slot]:
     A number next to a direction of other frames is refused, since it could be the opposite one.
     """
     directions = [_direction_of(slot, num_frames) for slot in slots]
-    words, numbers = (
-        {direction for slot, direction in zip(slots, directions, strict=True) if direction and slot.is_word == is_word}
-        for is_word in (True, False)
-    )
-    for slot, direction in zip(slots, directions, strict=True):
-        is_named = direction is not None and direction[0] in {name for name, *_ in words}
-        if not slot.is_word and is_named and direction not in words:
+    pairs = list(zip(slots, directions, strict=True))
+    of_words = {direction for slot, direction in pairs if direction and slot.is_word}
+    of_numbers = {direction for slot, direction in pairs if direction and not slot.is_word}
+    names_of_words = {direction.name for direction in of_words}
+    for slot, direction in pairs:
+        if direction and not slot.is_word and direction.name in names_of_words and direction not in of_words:
             fix = "a side or a trend in its sentence is of other frames; name the same frames in both slots"
             raise InvalidSlot(f"{{{slot.name}}}: {fix}")
     return [
-        replace(slot, is_paired=direction in (numbers if slot.is_word else words))
-        for slot, direction in zip(slots, directions, strict=True)
+        replace(slot, is_paired=direction in (of_numbers if slot.is_word else of_words)) for slot, direction in pairs
     ]
 
 
-def _direction_of(slot: Slot, num_frames: int) -> tuple[str, int, int] | None:
-    """Return the direction that a word states, or that the sign of a number means, and its frames; None without one."""
-    reference = slot.reference
-    if reference is None or reference.quantity in WORDS:
+def _direction_of(slot: Slot, num_frames: int) -> Direction | None:
+    """Return the direction of a slot; None without one, as of a distance at a frame."""
+    if slot.reference is None or slot.reference.quantity in WORDS:
         return None
-    name, aspect, first, last = reference
-    end = num_frames - 1
-    start, at = 0 if first is None else first, end if first is None else first
+    name, aspect, first, last = slot.reference
+    last_frame = num_frames - 1
+    since = 0 if first is None else first
+    until = last_frame if last is None else last
+    frame = last_frame if first is None else first  # of a value at one frame
     if aspect == "comparison":
-        return "comparison", 0, end
-    if name == "yaw" and not aspect:
-        return "side:yaw", 0, at
+        return Direction("comparison", 0, last_frame)
+    if name == "yaw" and not aspect:  # a yaw is counted from t0
+        return Direction("side:yaw", 0, frame)
     if name in TURNS and aspect in ("change", "rate", "growth", "side"):
-        return f"side:{name}", start, end if last is None else last
+        return Direction(f"side:{name}", since, until)
     if not QUANTITIES[name].sides and aspect in ("change", "rate", "growth", "trend"):
-        return f"trend:{name}", start, end if last is None else last
-    return (f"side:{name}", at, at) if aspect == "side" or (not aspect and has_sides(name)) else None
+        return Direction(f"trend:{name}", since, until)
+    if aspect == "side" or (not aspect and has_sides(name)):
+        return Direction(f"side:{name}", frame, frame)
+    return None
 
 
 # --- words around a slot ----------------------------------------------------------------------------------------------
 
+# Words with which the other side of a comparison begins: target, pedestrian, it, he, she, that one, drone.
 _ZH_COMPARED = ("目标", "行人", "其", "它", "他", "她", "对方", "该", "被", "人", "步行", "无人机", "本机")
 
 
 def _needs_side(before: str, after: str, language: Language) -> bool:
+    """Return whether only a side fits between these texts: "to the {}", "{} of", "向{}转"."""
     if language == "zh":
         is_led = re.search(r"(?:(?<![方航])向|[朝往偏])\s*$", before)
         return bool(is_led) or after.startswith(("侧", "方", "边", "转", "偏", "拐"))
@@ -228,6 +234,7 @@ def _without_repetition(slot: Slot, after: str, language: Language) -> str:
 
 @cache
 def _unit_pattern(language: Language) -> re.Pattern[str]:
+    """Return the pattern of a unit behind a slot, such as " m/s" or "米"."""
     known = sorted(spellings(language), key=len, reverse=True)
     options = "|".join(re.escape(s) + (r"(?![A-Za-z/])" if s[-1].isalpha() and s.isascii() else "") for s in known)
     return re.compile(rf"[\s-]*({options})", re.IGNORECASE)
