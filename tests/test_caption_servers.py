@@ -30,6 +30,8 @@ from caption.teachers.doctor import ODD_WORD, Finding, examine_endpoint
 from cosfly.formats.captions import Usage
 from cosfly.llm.client import KEY_VARIABLE, ChatClient, EndpointConfig
 from cosfly.llm.contract import Reply, Request
+from cosfly.llm.protocol import MEANINGS
+from cosfly.llm.student_chat import StudentEndpointConfig
 from cosfly.runtime.errors import NothingKept, TeacherError
 from specimens import make_playback_tree
 
@@ -312,7 +314,7 @@ LISTS: dict[str, tuple] = {
         "has several models; got 10000 models"),
     "a body of 20 MB": (page(200, " " * 20_000_000), "does not return a list of models"),
     "headers that never end": (raw(HEAD, b"X: y\r\n", pause_s=0.02, is_endless=True),
-        "cannot reach the teacher; got no answer within 0.3 s"),
+        "cannot reach the server; got no answer within 0.3 s"),
 }  # fmt: skip
 
 
@@ -483,3 +485,10 @@ def test_the_command_exits_with_1_when_unusable():
         assert invoke("caption doctor", server.url).exit_code == 0
     with TeacherServer(respond=patient(max_images=0)) as server:
         assert invoke("caption doctor", server.url).exit_code == 1
+
+
+def test_a_fix_names_the_settings_of_its_client():
+    fixes = [
+        ChatClient("http://h", cfg).fix_of(MEANINGS["too_long"]) for cfg in (EndpointConfig(), StudentEndpointConfig())
+    ]
+    assert ["caption.endpoint.max_tokens" in fixes[0], "distill.infer.endpoint.max_tokens" in fixes[1]] == [True, True]

@@ -109,7 +109,7 @@ def test_unreachable_and_unknown_model_and_not_an_endpoint(tree, tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    with pytest.raises(TeacherError, match=f"127.0.0.1:{port}/v1: cannot reach the teacher"):
+    with pytest.raises(TeacherError, match=f"127.0.0.1:{port}/v1: cannot reach the server"):
         run(settings(f"http://127.0.0.1:{port}"), tree, tmp_path / "a")
     with TeacherServer(models=("one", "two")) as server:
         with pytest.raises(TeacherError, match="does not have this model; got three; expected one of one, two"):

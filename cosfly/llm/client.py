@@ -22,7 +22,7 @@ from pydantic import Field
 
 from cosfly.llm import protocol
 from cosfly.llm.contract import NoAnswer, Reply, Request
-from cosfly.llm.protocol import KEY_VARIABLE, MEANINGS, BadReply, Kind, Refusal, Response
+from cosfly.llm.protocol import KEY_VARIABLE, MEANINGS, BadReply, Kind, Meaning, Refusal, Response
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import TeacherError
 from cosfly.runtime.model_json import CONTEXT_FULL
@@ -51,6 +51,7 @@ _tls = functools.cache(httpx.create_ssl_context)  # certificates are read once: 
 
 
 class EndpointConfig(Config):
+    section: ClassVar[str] = "caption.endpoint"  # where a user finds these settings, for messages
     model: str | None = Field(None, description="name of the model; empty: the endpoint's only model")
     temperature: float = Field(0.6, ge=0, le=2, description="sampling temperature; 0 is greedy")
     top_p: ClassVar[float] = 0.95  # nucleus sampling; extra_body may set another
@@ -213,7 +214,7 @@ class ChatClient:
         num_at_once = int(self.concurrency.limit)
         if not is_quick and num_at_once < self.cfg.concurrency:
             limit = f"at most {num_at_once} requests are sent at once until answers take less than a third of "
-            limit += "caption.endpoint.timeout_s; raise it if the server can answer more requests at once"
+            limit += f"{self.cfg.section}.timeout_s; raise it if the server can answer more requests at once"
             self._tell_once("slow", logging.INFO, f"an answer took {seconds:.0f} s, so {limit}")
         self._watch_prompts(reply, request)
         return self._with_full_context(reply, request)
@@ -272,7 +273,7 @@ class ChatClient:
     def _refused(self, refusal: Refusal, sent_s: float) -> NoAnswer | TeacherError:
         """Return the error of a refused request: NoAnswer for this try or this request, TeacherError for all."""
         if refusal.meaning.ends_run:
-            return self._error(refusal.meaning.what, got=str(refusal), fix=refusal.meaning.fix)
+            return self._error(refusal.meaning.what, got=str(refusal), fix=self.fix_of(refusal.meaning))
         if refusal.may_pass:
             if refusal.is_loading:
                 return NoAnswer(LOADING, str(refusal), wait_s=LOADING_PAUSE_S)
@@ -283,7 +284,7 @@ class ChatClient:
                 self.concurrency.was_busy(sent_s, None if is_long else wait_s)
             asked = f" (the server asks to wait {wait_s:.0f} s)" if is_long else ""
             return NoAnswer(f"http_{refusal.status}", f"{refusal}{asked}", wait_s=wait_s)
-        return NoAnswer(refusal.code, str(refusal), fix=refusal.meaning.fix, is_final=True)
+        return NoAnswer(refusal.code, str(refusal), fix=self.fix_of(refusal.meaning), is_final=True)
 
     def _with_full_context(self, reply: Reply, request: Request) -> Reply:
         """Mark an answer that the server cut before `max_tokens` because its context is full.
@@ -299,7 +300,7 @@ class ChatClient:
             return reply
         problem = f"an answer was cut after {usage.completion_tokens} of {most} tokens"
         meaning = MEANINGS["too_long"]
-        self._tell_once("context", logging.WARNING, f"{problem}: {meaning.what}; {meaning.fix}")
+        self._tell_once("context", logging.WARNING, f"{problem}: {meaning.what}; {self.fix_of(meaning)}")
         return replace(reply, finish_reason=CONTEXT_FULL)
 
     def _watch_prompts(self, reply: Reply, request: Request) -> None:
@@ -316,7 +317,7 @@ class ChatClient:
         if len(seen) == NUM_EQUAL_PROMPTS and len(tokens) == 1 and max(lengths) - min(lengths) >= LEAST_SPREAD:
             count = reply.usage.prompt_tokens
             problem = f"{len(seen)} prompts of different lengths all count {count} tokens: the server drops the rest"
-            self._tell_once("cuts", logging.WARNING, f"{problem}; {MEANINGS['too_long'].fix}")
+            self._tell_once("cuts", logging.WARNING, f"{problem}; {self.fix_of(MEANINGS['too_long'])}")
 
     async def start(self) -> None:
         """Read the server's list of models and choose the one of the settings; TeacherError if that fails."""
@@ -327,7 +328,7 @@ class ChatClient:
                 response = await self._exchange("models")
             except (TimeoutError, httpx.RequestError) as error:
                 fix = "start the server, or correct its address"
-                raise self._error("cannot reach the teacher", got=self.message_of(error), fix=fix) from None
+                raise self._error("cannot reach the server", got=self.message_of(error), fix=fix) from None
             refusal = protocol.read_refusal(response)
             refusal.message = self._clean(refusal.message)
             if response.status == 200 or not refusal.is_loading or time.monotonic() > deadline_s:
@@ -336,7 +337,7 @@ class ChatClient:
             await asyncio.sleep(LOADING_PAUSE_S)
         if response.status in (401, 403):
             meaning = refusal.meaning if refusal.meaning.ends_run else protocol.KEY
-            raise self._error(meaning.what, got=str(refusal), fix=meaning.fix)
+            raise self._error(meaning.what, got=str(refusal), fix=self.fix_of(meaning))
         models = protocol.read_models(response)
         if models is None and not wanted:
             what = "the server does not return a list of models, so it may not be an OpenAI-compatible endpoint"
@@ -350,13 +351,17 @@ class ChatClient:
         self.model = wanted or next(iter(models or ()))  # of a host without a list, the first request shows it
         self.context = (models or {}).get(self.model)
 
+    def fix_of(self, meaning: Meaning) -> str:
+        """Return the fix of a refusal, with the names of the settings of this client."""
+        return meaning.fix.replace(EndpointConfig.section, self.cfg.section)
+
     def _error(self, what: str, **parts: Any) -> TeacherError:
         return TeacherError(what, where=self.where, **parts)
 
     def message_of(self, error: Exception) -> str:
         """Return the message of an exchange that failed."""
         if isinstance(error, TimeoutError | httpx.TimeoutException):
-            fix = f"raise the limit, such as caption.endpoint.timeout_s={2 * self.cfg.timeout_s:g}, or use a"
+            fix = f"raise the limit, such as {self.cfg.section}.timeout_s={2 * self.cfg.timeout_s:g}, or use a"
             return f"no answer within {self.cfg.timeout_s:g} s; {fix} faster server, a smaller model or shorter prompts"
         return self._clean(f"{type(error).__name__} {error}")
 
