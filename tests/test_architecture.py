@@ -158,7 +158,7 @@ READING = {
 }
 GATE = (
     *(f"cosfly.runtime.{name}" for name in ("io", "json_io", "arrays", "tables", "model_json", "config")),
-    "cosfly.formats.meshes",
+    "cosfly.formats.mesh_files",
 )
 ALLOWED_TO_READ = {
     ("cosfly.runtime.ray_engine", "loads"),  # what a worker says, as `multiprocessing` reads it from a pipe

@@ -13,7 +13,8 @@ import trimesh
 from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.formats.frames import Look
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.meshes import MESHES_FILE, Meshes, MeshRef, read_meshes, write_meshes
+from cosfly.formats.mesh_files import read_meshes, write_meshes
+from cosfly.formats.meshes import MESHES_FILE, Meshes, MeshRef
 from cosfly.geometry.axes import intrinsic_matrix, look_at, world_from_camera
 from cosfly.maps import cityjson
 from cosfly.maps.cityjson import CityJsonConfig, solid_mesh
@@ -121,22 +122,27 @@ HOSTILE = {
     "far.glb": (one_triangle([1e30, *FLAT[1:]]), "not finite or is more than 10,000,000 m"),
     "count.glb": (
         one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 2_000_000_000}]),
-        "declares too many values, or a negative count",
+        "over the limit; got 666,666,666 triangles",
     ),
     "below_nothing.glb": (
         one_triangle(FLAT, bufferViews=[{"buffer": 0, "byteLength": n} for n in (36, -9, 36, 36)]),
-        "declares too many values, or a negative count",
+        "declares more bytes than there are, or a negative number",
     ),
     "short_buffer.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 6}]), "cannot be parsed"),
     "repeated.glb": (
         one_triangle(FLAT, bufferViews=[{"buffer": 0, "byteLength": 2**30}] * 9),
-        "declares too many values, or a negative count",
+        "declares more bytes than there are, or a negative number",
     ),
     "empty.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 0}]), "no triangles"),
     "sparse.glb": (
         one_triangle(FLAT, accessors=[{"componentType": 5126, "type": "VEC3", "count": 3}]),
         "sparse accessor",
     ),
+    "strip.glb": (
+        one_triangle(FLAT, meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 5}]}]),
+        "not a list of triangles",
+    ),
+    "negative.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": -3}]), "not a list of triangles"),
     "loop.glb": (one_triangle(FLAT, nodes=[{"mesh": 0, "children": [0]}], scenes=[{"nodes": [0]}]), "two parents"),
     "packed.glb": (one_triangle(FLAT, extensionsRequired=["EXT_meshopt_compression"]), "a glTF extension"),
     "out.glb": (one_triangle(FLAT, buffers=[{"byteLength": 36, "uri": "../secret.bin"}]), "data in another file"),
@@ -227,10 +233,10 @@ def test_missing_linked_and_large_files_are_clear_errors(tmp_path: Path) -> None
 
 def test_a_file_may_have_so_many_triangles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trimesh.creation.icosphere(subdivisions=3).export(tmp_path / "fine.glb")
-    monkeypatch.setattr("cosfly.formats.meshes.MOST_TRIANGLES", 500)
+    monkeypatch.setattr("cosfly.formats.mesh_files.MOST_TRIANGLES", 500)
     with pytest.raises(InputError, match="over the limit"):
         read_meshes(tmp_path / "fine.glb", tree=tmp_path)
-    monkeypatch.setattr("cosfly.formats.meshes.FILE_MB", 1e-3)
+    monkeypatch.setattr("cosfly.formats.mesh_files.FILE_MB", 1e-3)
     with pytest.raises(InputError, match="over the limit"):
         read_meshes(tmp_path / "fine.glb", tree=tmp_path)
 
