@@ -13,7 +13,7 @@ import cv2
 
 from cosfly.formats.captions import read_captions
 from cosfly.formats.frames import read_rgb
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
 
 CROP_PX = (360, 270)  # region around the target that is shown of each frame, at the size it has in a 1280x720 image

@@ -28,7 +28,8 @@ from cosfly.formats.frames import (
 )
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
-from cosfly.formats.playback import Perturbation, TargetRecord, Track, write_track
+from cosfly.formats.playback import Perturbation, TargetRecord, Track
+from cosfly.formats.playback_file import write_track
 from cosfly.geometry.axes import DT_S, box_corners, intrinsic_matrix, look_at, project, world_from_camera
 
 PERSON_ID = 0x1234  # two different bytes, so that a swap of the channels shows

@@ -6,7 +6,7 @@ from typing import Any
 
 from cosfly.formats.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
 from cosfly.formats.places import sample_id
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.predictions import Split
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.student_chat import ChatFormat, FrameFormat, write_chat_format

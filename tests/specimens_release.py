@@ -20,7 +20,7 @@ from cosfly.formats.inspection import (
     write_inspection,
 )  # fmt: skip
 from cosfly.formats.issues import Issue
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.pipeline import run as pipeline
 from cosfly.pipeline.settings import RunConfig

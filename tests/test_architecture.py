@@ -138,7 +138,7 @@ def test_axes_of_the_tree_are_converted_where_its_files_are_read_and_written():
     importers = {
         name for name, path in SOURCES.items() if re.search(r"^from .*\bmirror_poses\b", path.read_text(), re.M)
     }
-    assert importers == {"cosfly.formats.frames", "cosfly.formats.playback", "cosfly.simulators.conventions"}
+    assert importers == {"cosfly.formats.frames", "cosfly.formats.playback_file", "cosfly.simulators.conventions"}
 
 
 def test_heavy_packages_are_imported_where_they_are_used():

@@ -27,7 +27,7 @@ from caption.verification.facts import measure_facts
 from caption.verification.references import Fact, look_up, parse_reference
 from cosfly.formats.captions import OWN_PROMPTS, PICTURES_MARK, Coc, Prompt, read_captions
 from cosfly.formats.people import Goal
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.answer_text import parse_answer
 from cosfly.runtime.errors import ConfigError, ResumeError

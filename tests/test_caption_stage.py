@@ -26,7 +26,7 @@ from caption.teachers.judge import JUDGEMENTS, UNJUDGED, check_judge, gold_confl
 from caption.teachers.teacher import RuleTeacher
 from caption.verification.actions import TABLE, measure
 from cosfly.formats.captions import Caption, Coc, read_captions
-from cosfly.formats.playback import read_track, write_track
+from cosfly.formats.playback_file import read_track, write_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.contract import NoAnswer
 from cosfly.runtime.errors import NothingKept, ResumeError, TeacherError
@@ -148,7 +148,7 @@ def test_bad_flights_are_counted_and_the_others_captioned(tree, tmp_path):
     # Frame 6 is observed by the windows at 6..10, of those at 4..12.
     assert report["windows"] == {"input": 18, "kept": 13, "dropped": {"unusable_frame": 5}, "failed": {}}
     failures = (out / "failures.jsonl").read_text()
-    assert "points[3].drone_pose.x: the field is missing or null" in failures
+    assert "points[3].drone_pose.x: Input should be a valid number; got null" in failures
     assert "not valid JSON" in failures
 
 

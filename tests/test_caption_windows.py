@@ -19,7 +19,8 @@ from caption.teachers.teacher import encode_frame
 from caption.verification.actions import TABLE, measure
 from caption.verification.facts import measure_facts
 from cosfly.formats.boxes import MapHeader, make_box_map
-from cosfly.formats.playback import Perturbation, Track, read_track, write_track
+from cosfly.formats.playback import Perturbation, Track
+from cosfly.formats.playback_file import read_track, write_track
 from cosfly.formats.segments import Mission
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, perturb

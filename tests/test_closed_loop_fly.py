@@ -20,7 +20,7 @@ from cosfly.closed_loop.settings import Drone
 from cosfly.closed_loop.stepper import ClosedLoopTrajectory
 from cosfly.formats.captions import read_captions
 from cosfly.formats.episodes import EPISODES, Episode, read_episode
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.student_chat import read_chat_format, write_chat_format
 from cosfly.runtime.errors import NothingKept

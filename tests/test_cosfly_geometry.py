@@ -14,7 +14,7 @@ from tables import each
 
 from cosfly.formats.boxes import make_box_map
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.playback import read_track, write_track
+from cosfly.formats.playback_file import read_track, write_track
 from cosfly.formats.roi import Roi
 from cosfly.formats.segments import Mission, Segment
 from cosfly.formats.traces import DroneTrace

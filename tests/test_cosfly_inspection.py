@@ -16,7 +16,7 @@ from cosfly.formats.frames import BystanderMeta, BystandersMeta, depth_file, fra
 from cosfly.formats.inspection import read_inspection
 from cosfly.formats.issues import Report
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.traces import DroneTrace, write_traces
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import mask_box, wrap_deg

@@ -16,7 +16,7 @@ from cosfly.formats.frames import Camera, Look, frame_name, read_depth, read_ins
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.people import Appearance, People
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import focal_px, intrinsic_matrix, look_at, wrap_deg
 from cosfly.geometry.goals import SIDES, target_picture

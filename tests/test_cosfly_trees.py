@@ -25,7 +25,7 @@ from caption.stage import stage as caption_stage
 from cosfly.formats.captions import Verdict, read_captions
 from cosfly.formats.inspection import read_inspection
 from cosfly.formats.places import TrackChoice
-from cosfly.formats.playback import read_track, write_track
+from cosfly.formats.playback_file import read_track, write_track
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.geometry.splits import SPLITS
 from cosfly.inspection import stage as inspection

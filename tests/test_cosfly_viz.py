@@ -29,7 +29,7 @@ from caption.teachers.teacher import RuleTeacher, encode_frame
 from cosfly.formats.boxes import make_box_map, write_boxes
 from cosfly.formats.captions import PICTURES_MARK, Language, write_captions
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.student_chat import encoded_image
 from cosfly.render.settings import RenderConfig

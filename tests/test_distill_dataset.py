@@ -18,7 +18,8 @@ from tables import each
 from cosfly.formats.captions import read_captions, write_captions
 from cosfly.formats.frames import frame_name
 from cosfly.formats.inspection import write_inspection
-from cosfly.formats.playback import Track, read_track
+from cosfly.formats.playback import Track
+from cosfly.formats.playback_file import read_track
 from cosfly.geometry.splits import SPLITS
 from cosfly.inspection.blind_baseline import past_of
 from cosfly.runtime.errors import ConfigError, InputError, ResumeError

@@ -39,7 +39,7 @@ from cosfly.formats.captions import Caption, read_captions
 from cosfly.formats.frames import DEPTH_PNG, read_depth, read_instance, read_meta, read_rgb
 from cosfly.formats.inspection import Inspection, read_inspection
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.roi import read_roi
 from cosfly.formats.traces import write_traces
 from cosfly.formats.tracks import find_tracks

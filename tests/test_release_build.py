@@ -29,7 +29,7 @@ from cosfly.formats.boxes import MapHeader
 from cosfly.formats.captions import write_captions
 from cosfly.formats.frames import read_depth, read_instance, read_rgb
 from cosfly.formats.inspection import write_inspection
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.town import write_town_map
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import ConfigError, InputError, NothingKept, VerifyError

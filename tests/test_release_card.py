@@ -27,7 +27,7 @@ from cosfly.formats.frames import (
     frame_path,
 )
 from cosfly.formats.people import People
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.geometry.goals import SIDES, SLOTS, words_of

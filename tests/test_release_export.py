@@ -20,7 +20,7 @@ from specimens_release import NUM_POINTS, all_bytes, make_release, rows_by_id
 from tables import each
 
 import specimens
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.town import read_town_map
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.config import build as build_config

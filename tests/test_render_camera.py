@@ -23,7 +23,7 @@ from cosfly.formats.frames import (
     read_rgb,
 )
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.playback import read_track, write_track
+from cosfly.formats.playback_file import read_track, write_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.formats.weather import TIMES, WEATHERS, WeatherParams, resolved
 from cosfly.geometry.axes import intrinsic_matrix

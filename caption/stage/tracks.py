@@ -14,7 +14,7 @@ from pathlib import Path
 from caption.schema import CaptionConfig, Window, WindowConfig
 from caption.stage.windows import current_frames, cut_windows
 from cosfly.formats.places import flight_ids, place_of
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.runtime.errors import InputError, VerifyError
 

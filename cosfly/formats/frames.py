@@ -121,18 +121,18 @@ def _read_axes(names: tuple[str, ...], value: Any) -> np.ndarray:
     raise ValueError(f"the value must be an object whose fields {', '.join(names)} are finite numbers")
 
 
-def _write_axes(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:
+def write_axes(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:
     """Convert an array in the project's axes to an object of a file, in the tree's axes."""
     return dict(zip(names, (mirror_poses(values) + 0.0).tolist(), strict=True))  # + 0.0 turns -0.0 into 0.0
 
 
 # In memory arrays in the project's axes: Position (3,) m, Angles (3,) degrees, Pose (6,) both. In a file objects of
 # numbers by name, in the tree's axes.
-Position = Annotated[np.ndarray, PlainValidator(partial(_read_axes, XYZ)), PlainSerializer(partial(_write_axes, XYZ))]
+Position = Annotated[np.ndarray, PlainValidator(partial(_read_axes, XYZ)), PlainSerializer(partial(write_axes, XYZ))]
 Angles = Annotated[
-    np.ndarray, PlainValidator(partial(_read_axes, ANGLES)), PlainSerializer(partial(_write_axes, ANGLES))
+    np.ndarray, PlainValidator(partial(_read_axes, ANGLES)), PlainSerializer(partial(write_axes, ANGLES))
 ]
-Pose = Annotated[np.ndarray, PlainValidator(partial(_read_axes, POSE)), PlainSerializer(partial(_write_axes, POSE))]
+Pose = Annotated[np.ndarray, PlainValidator(partial(_read_axes, POSE)), PlainSerializer(partial(write_axes, POSE))]
 
 
 def tree_yaw(yaw_deg: float) -> float:

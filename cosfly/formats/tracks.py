@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.formats.places import ALL_TRACKS, TRACKS, TrackChoice, TrackName
-from cosfly.formats.playback import ORIGINAL, Track, read_track
+from cosfly.formats.playback import ORIGINAL, Track
+from cosfly.formats.playback_file import read_track
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.io import files_named
 

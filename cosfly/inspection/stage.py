@@ -20,7 +20,7 @@ from cosfly.formats.inspection import (
     write_inspection,
 )
 from cosfly.formats.issues import Report
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.traces import DroneTrace, read_traces, read_yaw_rate_max
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.trajectory_metrics import YAW_RATE_MAX_DEGPS

@@ -16,7 +16,8 @@ from cosfly.formats.frames import LEGIBLE_HEIGHT_PX
 from cosfly.formats.inspection import Result, TrackInspection
 from cosfly.formats.issues import Report
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
-from cosfly.formats.playback import Track, read_track
+from cosfly.formats.playback import Track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.traces import DroneTrace
 from cosfly.geometry.axes import project, step_s, world_from_camera, wrap_deg
 from cosfly.geometry.trajectory_metrics import (

@@ -17,7 +17,8 @@ from cosfly.formats.frames import BystandersMeta, Camera, FrameMeta, Look, Targe
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M, pace_field
 from cosfly.formats.people import Appearance, Goal, People
-from cosfly.formats.playback import LEGIBILITY, TARGET_FILE, Perturbation, TargetRecord, Track, write_track
+from cosfly.formats.playback import LEGIBILITY, TARGET_FILE, Perturbation, TargetRecord, Track
+from cosfly.formats.playback_file import write_track
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry.axes import mask_box, world_from_camera

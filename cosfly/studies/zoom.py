@@ -14,7 +14,8 @@ import numpy as np
 
 import cosfly.render.stage
 from cosfly.formats.frames import Camera, level_name, read_rgb, rgb_bytes
-from cosfly.formats.playback import Track, read_track
+from cosfly.formats.playback import Track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import box_iou, intrinsic_matrix
 from cosfly.render.camera import ZoomConfig

@@ -10,7 +10,8 @@ from PIL import Image
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import FRAME_FILES, frame_path, read_instance, read_meta, read_rgb, rgb_bytes
 from cosfly.formats.places import ALL_TRACKS, TrackChoice
-from cosfly.formats.playback import Track, read_track
+from cosfly.formats.playback import Track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.town import read_instance_ids
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import InputError

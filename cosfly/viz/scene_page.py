@@ -18,7 +18,8 @@ from cosfly.formats.frames import read_rgb
 from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES, KINDS, LAYERS
 from cosfly.formats.pedestrian_paths import read_paths
 from cosfly.formats.places import town_folder
-from cosfly.formats.playback import Track, read_track
+from cosfly.formats.playback import Track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import rotation_matrices

@@ -20,7 +20,8 @@ from cosfly.formats.frames import frame_path
 from cosfly.formats.inspection import read_settled
 from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES
 from cosfly.formats.places import Place, folder_name, place_of, town_folder
-from cosfly.formats.playback import Track, read_track
+from cosfly.formats.playback import Track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError

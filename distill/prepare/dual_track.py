@@ -13,7 +13,8 @@ import numpy as np
 from pydantic import Field
 
 from cosfly.formats.places import Place, flight_ids, place_of, sample_id
-from cosfly.formats.playback import ORIGINAL, Track, read_track
+from cosfly.formats.playback import ORIGINAL, Track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.geometry.axes import step_s
 from cosfly.geometry.splits import SPLITS, Course, walks_of

@@ -22,7 +22,7 @@ from cosfly.formats.frames import frame_name, frame_path
 from cosfly.formats.places import Place as TrackPlace
 from cosfly.formats.places import flight_ids, folder_name, sample_id
 from cosfly.formats.places import place_of as track_place
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.predictions import Split
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.splits import SPLITS, Course, assign_splits, town_family, walks_of

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 from cosfly.formats.frames import DEPTH_PNG, FILE_NAMES, frame_name, frame_path
 from cosfly.formats.inspection import how_to_decide
 from cosfly.formats.places import TrackChoice, TrackName
-from cosfly.formats.playback import Track, read_track
+from cosfly.formats.playback import Track
+from cosfly.formats.playback_file import read_track
 from cosfly.geometry.splits import Course, walks_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError, NothingKept

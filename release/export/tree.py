@@ -20,7 +20,8 @@ from cosfly.formats.frames import BYSTANDER_COLUMNS, COORDINATES, FILE_NAMES, fr
 from cosfly.formats.pedestrian_paths import pace_field
 from cosfly.formats.people import Goal
 from cosfly.formats.places import TOWN
-from cosfly.formats.playback import DATASET_FORMAT, LEGIBILITY, TARGET_FILE, Track, write_track
+from cosfly.formats.playback import DATASET_FORMAT, LEGIBILITY, TARGET_FILE, Track
+from cosfly.formats.playback_file import write_track
 from cosfly.formats.segments import FOLLOW, Segment
 from cosfly.formats.town import TOWN_FILE, TOWN_FORMAT, TownMap
 from cosfly.runtime.console import Advance

@@ -28,7 +28,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from specimens_distill import make_captions
 
 from cosfly.formats.frames import FILE_NAMES, FrameFile, depth_bytes, frame_name, instance_bytes, rgb_bytes
-from cosfly.formats.playback import Track, write_track
+from cosfly.formats.playback import Track
+from cosfly.formats.playback_file import write_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.io import CHECKSUMS, checksum_lines, sha256_bytes
 from release.build.config import ReleaseConfig

@@ -29,7 +29,7 @@ from transformers import (
 from transformers.models.smolvlm.image_processing_pil_smolvlm import SmolVLMImageProcessorPil
 
 from cosfly.formats.frames import FILE_NAMES, frame_name
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
 
 SIDE_PX, PATCH_PX, SCALE = 256, 16, 4  # pictures are squeezed into a square; SCALE x SCALE patches become a token
