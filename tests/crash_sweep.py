@@ -76,9 +76,9 @@ def load_all() -> None:
     warm_up(PlanConfig(planner="foresight"))
 
 
-def _walk(place: Place) -> Path:
+def _track(place: Place) -> Path:
     tree = Path(place.given("base")) / "render"
-    return next(tree.glob("Town*/trajectory_*")).relative_to(tree)
+    return next(tree.glob("Town*/trajectory_*/*")).relative_to(tree)
 
 
 def _students(place: Place) -> Path:
@@ -117,7 +117,7 @@ def _simulator(protocol: str, place: Place) -> int:
 
 
 INPUTS: dict[str, Callable[[Place], object]] = {
-    "base": lambda place: place.do("run", place.root / "base"), "walk": _walk, "students": _students,
+    "base": lambda place: place.do("run", place.root / "base"), "track": _track, "students": _students,
     "trained": lambda place: place.do("distill train", place.root / "trained"),
     "inferred": lambda place: place.do("distill infer", place.root / "inferred"),
     "flown": lambda place: place.do("fly", place.root / "flown"),
@@ -184,7 +184,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "inspect": ["inspect --map {simple} --traces {traces} --data {tree} --out {out} {tiny}"],
     "inspect review": [
         lambda place, out: copy_stage(place, out, "inspect"),
-        "inspect review --inspect {out} --reject {walk} --by somebody --reason 'too near'",
+        "inspect review --inspect {out} --reject {track} --by somebody --reason 'too near'",
     ],
     "reproduce": ["reproduce {base} --out {out} --pedestrians 1 --workers 1"],
     "study depth": ["study depth --data {tree} --out {out}"],

@@ -99,6 +99,8 @@ def test_the_command_decides_and_says_what_is_open(product):
     assert done.exit_code == 0, done.output
     assert "4 tracks in review: 2 accepted, 1 rejected, 1 open" in done.output
     assert ask().output == done.output
+    both = ask("--reject", first.rpartition("/")[0], "--by", "Bo", "--reason", "steady")
+    assert "lists no track in this folder" in str(both.exception)
 
 
 NUM = 12

@@ -185,16 +185,13 @@ def inspect(
     job.run("cosfly.inspection.stage", job.cfg.inspect, map_, traces, job.tree(data), out)
 
 
-TRACK_HELP = "a track, or all tracks of a trajectory; repeat it."
-
-
 @options.groups["inspect"].command(
-    epilog="cosfly inspect review --inspect inspect --accept trajectory_1 --by me --reason clear"
+    epilog="cosfly inspect review --inspect inspect --accept Town01/trajectory_1/ORI --by me --reason clear"
 )
 def review(
     folder: Annotated[Path, Option("--inspect", help="Output directory of the inspection, or its inspect.json.")],
-    accept: Annotated[list[str] | None, Option(metavar="TRACK", help=f"Accept {TRACK_HELP}")] = None,
-    reject: Annotated[list[str] | None, Option(metavar="TRACK", help=f"Reject {TRACK_HELP}")] = None,
+    accept: Annotated[list[str] | None, Option(metavar="TRACK", help="Accept a track; repeat it.")] = None,
+    reject: Annotated[list[str] | None, Option(metavar="TRACK", help="Reject a track; repeat it.")] = None,
     by: Annotated[str | None, Option(help="Name of the reviewer.")] = None,
     reason: Annotated[str | None, Option(help="Reason of the decision.")] = None,
 ) -> None:

@@ -136,7 +136,7 @@ def read_inspection(path: Path) -> Inspection:
 
 
 class Choice(Record):
-    """A person's verdict. folder: Of a track, or of a trajectory, relative to the playback tree."""
+    """A person's verdict. folder: Of a track, relative to the playback tree."""
 
     folder: str
     verdict: Literal["accepted", "rejected"]
@@ -223,42 +223,29 @@ def read_settled(inspected: Path) -> Inspection:
 
 
 def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[Decision]:
-    """Record all choices, or none of them.
-
-    A trajectory's folder means its tracks in review; a rejection also covers those that were accepted.
-    """
+    """Record all choices, or none of them."""
     read_decisions(inspected)  # existing ones must be of this inspection
     digest = sha256_file(inspected)
     now = datetime.now(UTC).isoformat(timespec="seconds")
-    tracks = read_inspection(inspected).flights
+    tracks = {track.folder: track for track in read_inspection(inspected).flights}
     decisions: list[Decision] = []
     for choice in choices:
-        for track in _chosen(choice, tracks, inspected):
-            if track.result == "rejected" and choice.verdict == "accepted":
-                raise InputError(
-                    "the track breaks a rule of the inspection, so it cannot be accepted",
-                    where=track.folder,
-                    got=track.reason or "rejected",
-                    expected="a track with the result `review`",
-                    fix="render the track again, or change the threshold of this rule, and run the inspection again",
-                )
-            file = {"folder": track.folder, "sha256": track.sha256, "inspection": digest}
-            decisions.append(Decision(**file, verdict=choice.verdict, reason=choice.reason, by=by, at=now))
+        track = tracks.get(choice.folder.strip("/"))
+        if track is None:
+            what = "the inspection file lists no track in this folder"
+            expected = f"the folder of a track, such as {', '.join(_in_review(tracks.values())[:3])}"
+            raise InputError(what, where=inspected, got=choice.folder, expected=expected)
+        if track.result == "rejected" and choice.verdict == "accepted":
+            raise InputError(
+                "the track breaks a rule of the inspection, so it cannot be accepted",
+                where=track.folder,
+                got=track.reason or "rejected",
+                expected="a track with the result `review`",
+                fix="render the track again, or change the threshold of this rule, and run the inspection again",
+            )
+        file = {"folder": track.folder, "sha256": track.sha256, "inspection": digest}
+        decisions.append(Decision(**file, verdict=choice.verdict, reason=choice.reason, by=by, at=now))
     with Journal(inspected.with_name(REVIEW)) as journal:
         for decision in decisions:
             journal.append(decision.model_dump())
     return decisions
-
-
-def _chosen(choice: Choice, tracks: list[TrackInspection], inspected: Path) -> list[TrackInspection]:
-    """Return the tracks that a choice decides."""
-    name = choice.folder.strip("/")
-    tracks_of_name = [track for track in tracks if track.folder == name]
-    of_trajectory = [track for track in tracks if track.folder.rpartition("/")[0] == name]
-    results = ("review",) if choice.verdict == "accepted" else ("review", "accepted")
-    chosen = tracks_of_name or [track for track in of_trajectory if track.result in results] or of_trajectory
-    if not chosen:
-        expected = f"the folder of a track or of a trajectory, such as {', '.join(_in_review(tracks)[:3])}"
-        what = "the inspection file lists no track or trajectory in this folder"
-        raise InputError(what, where=inspected, got=choice.folder, expected=expected)
-    return chosen
