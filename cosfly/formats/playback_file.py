@@ -31,6 +31,7 @@ Value = TypeVar("Value")
 SCHEMA, SCHEMA_VERSION = "drone_nav_traj_v7", "7.0.0"
 WAYPOINT_TOLERANCE_M = 1e-5  # the bound of the public readers on nav_waypoint.t1_world
 INTRINSIC = "a 3x3 matrix with a positive focal length"
+MOST_POINTS = 500_000  # four hours at 30 Hz; each takes kilobytes of memory while it is read
 STEP_TOLERANCE_S = 1e-3  # largest difference between a time step and the median step
 BBOX, UV = ("xmin", "ymin", "xmax", "ymax"), ("u", "v")
 OFFSETS = {"drone_position": XYZ, "drone_rotation": ANGLES, "target_position": XYZ}  # in a point's perturbation
@@ -117,7 +118,9 @@ class _Point(BaseModel):
 
 
 class _File(BaseModel):
-    points: list[_Point] = Field(min_length=1, validation_alias=AliasChoices("points", "waypoints"))
+    points: list[_Point] = Field(
+        min_length=1, max_length=MOST_POINTS, validation_alias=AliasChoices("points", "waypoints")
+    )
     camera: _Camera
 
 
