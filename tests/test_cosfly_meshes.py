@@ -375,8 +375,8 @@ def test_depth_and_ids_are_those_of_trimesh_rays(traced_views, name: str) -> Non
     renderer, shown = open_renderer(name, box_map, *SIZE, Look()), set[int]()
     for pose, depth, ids in views:
         renderer.prepare(np.array([-20.0, -20.0, 0.0]), np.array([25.0, 25.0, 30.0]))
-        frame = renderer.render(pose, INTRINSIC, None)
-        again = renderer.render(pose, INTRINSIC, None)
+        frame = renderer.render(pose, INTRINSIC, {})
+        again = renderer.render(pose, INTRINSIC, {})
         for part in ("rgb", "depth", "kinds", "ids"):
             np.testing.assert_array_equal(getattr(frame, part), getattr(again, part))
         known = np.isfinite(depth)

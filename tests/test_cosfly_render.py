@@ -27,7 +27,6 @@ from cosfly.render.contract import (
     PERSON_ID,
     SHARED_ID,
     Frame,
-    PosedBystander,
     PosedPerson,
     has_own_ids,
     instance_ids,
@@ -108,10 +107,10 @@ def test_the_figure_stands_on_the_ground_within_the_targets_box(heading, phase, 
 
 def test_look_alikes_differ_from_the_target_in_one_thing_and_nobody_looks_just_like_it():
     target = draw_appearance(np.random.default_rng(1))
-    stands = Bystander("Pedestrians", np.zeros((2, 3)), np.zeros(2))
-    others = [Bystander("Car", np.zeros((2, 3)), np.zeros(2)), replace(stands, is_look_alike=True), stands] * 20
+    stands = Bystander(np.zeros((2, 3)), np.zeros(2))
+    others = [replace(stands, is_look_alike=True), stands] * 20
     people = dress_bystanders(others, np.arange(2) * 0.5, target, np.random.default_rng(0)).people(target)
-    assert list(people.others) == [other_id(number) for number in range(60) if number % 3]
+    assert list(people.others) == [other_id(number) for number in range(40)]
     different = np.array([len(target.differences(looks)) for looks in people.others.values()])
     assert (different[::2] == 1).all()
     assert (different[1::2] >= 1).all()
@@ -394,9 +393,9 @@ class Curtain:
 
     def close(self) -> None: ...
 
-    def render(self, camera_pose, intrinsic, person, others=()) -> Frame:
+    def render(self, camera_pose, intrinsic, people) -> Frame:
         self.num_drawn += 1
-        shape, is_hidden = (CAMERA.height_px, CAMERA.width_px), person.hip_m[0] > self.x_m
+        shape, is_hidden = (CAMERA.height_px, CAMERA.width_px), people[PERSON_ID].hip_m[0] > self.x_m
         ids = np.full(shape, 0 if is_hidden else PERSON_ID, dtype=np.uint16)
         depth = np.full(shape, 0.5 if is_hidden else 1000.0, dtype=np.float32)
         return Frame(np.zeros((*shape, 3), np.uint8), depth, np.zeros(shape, np.uint8), ids)
@@ -461,7 +460,7 @@ def test_what_a_wall_hides_is_not_said(y_m, says_legs):
         both = {PERSON_ID: LOOKS, **people.others} | {number: looks}
         dressed = [replace(clothes, looks=one) for one in both.values()]
         bodies = [PosedPerson(hip_m, 0.0, 0.5, 1.0, one) for hip_m, one in zip(hips_m, dressed, strict=True)]
-        return renderer.render(pose, intrinsic, bodies[0], [PosedBystander(other_id(0), bodies[1])])
+        return renderer.render(pose, intrinsic, dict(zip(both, bodies, strict=True)))
 
     goal = find_goal(people, 3, draw, 8)
     renderer.close()
@@ -482,7 +481,7 @@ def make_crowded_tree(folder):
     traces = [circling(3, f"path_{k:03d}") for k in range(2)]
     places_m = [[x, y, -0.9] for x in (-4.0, -1.5, 1.0, 3.5) for y in (-2.0, 2.0)]
     crowd = [
-        Bystander("Pedestrians", trace.targets_m + place_m, np.zeros(3), k < 4)
+        Bystander(trace.targets_m + place_m, np.zeros(3), k < 4)
         for trace in traces for k, place_m in enumerate(places_m)
     ]  # fmt: skip
     write_bystanders(

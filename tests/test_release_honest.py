@@ -61,7 +61,7 @@ MAPS = {
     "park_styles": (None,
         ["maps.synthetic.preset=park", "plan.planner=muco", "plan.styles={orbit_left: 1, rise: 1}",
             "pedestrians.pace={hurry: 1, stop_and_look: 1}"]),
-    "crowd": (None, ["maps.synthetic.preset=market", "pedestrians.others=6", "pedestrians.traffic=4"]),
+    "crowd": (None, ["maps.synthetic.preset=market", "pedestrians.others=6"]),
     "one": (None, ["pedestrians.num_paths=1"]),
     "carla": (None, ["maps.source=carla", "maps.carla.port=CARLA_PORT"]),
     "unrealcv": (None, ["maps.source=unrealcv", "maps.unrealcv.port=UNREALCV_PORT"]),

@@ -30,6 +30,7 @@ from cosfly.geometry.axes import intrinsic_matrix
 from cosfly.pipeline.runs import small_targets
 from cosfly.pipeline.settings import RunConfig
 from cosfly.render.camera import ZoomConfig, legibility, zoomed_deg
+from cosfly.render.contract import PERSON_ID
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
 from cosfly.render.weather import path_seed, read_pools, weather_of
@@ -225,7 +226,7 @@ def renderer():
 
 def drawn(renderer, knobs: WeatherParams | None, pose: np.ndarray = POSE):
     renderer.prepare(np.array([-60.0, -60.0, 0.0]), np.array([60.0, 60.0, 20.0]), knobs)
-    return renderer.render(pose, intrinsic_matrix(*SIZE, 70.0), WALKER)
+    return renderer.render(pose, intrinsic_matrix(*SIZE, 70.0), {PERSON_ID: WALKER})
 
 
 def labels(frame) -> str:

@@ -44,8 +44,6 @@ from cosfly.render.contract import (
     NEAR_M,
     NO_INSTANCE,
     PERSON_ID,
-    PosedBystander,
-    PosedCar,
     PosedPerson,
     other_id,
     plane_z_m,
@@ -199,7 +197,7 @@ def test_depth_and_ids_agree_with_computed_rays(renderer, subtests):
     for eye, target, intrinsic in [*lenses, *odd]:
         with subtests.test(eye=eye, focal_px=intrinsic[0, 0]):
             pose = pose_towards(eye, target)
-            frame = renderer.render(pose, intrinsic, None)
+            frame = renderer.render(pose, intrinsic, {})
             depth, kinds, ids = traced(street(), plane_z_m(street()), pose, intrinsic)
             inner = away_from_silhouettes(depth, ids)
             assert inner.mean() > 0.5
@@ -218,7 +216,7 @@ def test_of_coplanar_surfaces_the_higher_layer_is_seen(renderer_name):
     halves = [(2.0, 3.0, 0.1)] * len(kinds)
     box_map = make_box_map(centers, halves, np.zeros((5, 3)), [KINDS[kind] for kind in kinds])
     renderer = opened(renderer_name, box_map)
-    frame = renderer.render(pose_towards((4.0, -9.0, 8.0), (4.0, 0.0, 0.0)), intrinsic_matrix(*SIZE, 70.0), None)
+    frame = renderer.render(pose_towards((4.0, -9.0, 8.0), (4.0, 0.0, 0.0)), intrinsic_matrix(*SIZE, 70.0), {})
     renderer.close()
     row = frame.ids[SIZE[1] // 2]
     steps = row[row > 0]
@@ -241,7 +239,7 @@ def test_of_coplanar_surfaces_of_one_kind_always_the_same_one_is_seen(renderer_n
         inside = cv2.fillConvexPoly(np.zeros(SIZE[::-1], np.uint8), np.round(corners).astype(np.int32), 1) > 0
         inside = cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         assert inside.sum() > 200
-        seen.append(np.unique(renderer.render(pose, intrinsic, None).ids[inside]).tolist())
+        seen.append(np.unique(renderer.render(pose, intrinsic, {}).ids[inside]).tolist())
     renderer.close()
     assert seen == [[2]] * 4
 
@@ -251,7 +249,7 @@ def test_depth_is_exact_far_from_the_world_origin(renderer_name):
     renderer = opened(renderer_name, street(offset))
     pose = pose_towards(np.add(VIEWS[0][0], offset), np.add(VIEWS[0][1], offset))
     intrinsic = intrinsic_matrix(*SIZE, 60.0)
-    frame = renderer.render(pose, intrinsic, None)
+    frame = renderer.render(pose, intrinsic, {})
     depth, _, ids = traced(street(offset), plane_z_m(street(offset)), pose, intrinsic)
     inner = away_from_silhouettes(depth, ids) & (depth < 60.0)
     renderer.close()
@@ -282,7 +280,7 @@ def test_depth_of_the_default_renderer_to_a_fifth_of_a_millimetre(
     for eye, aim in (((0.271, 3.113, 14.07), (60.0, 0.0, 4.0)), ((2.019, -9.333, 25.0), (40.0, 3.0, 0.0))):
         pose, intrinsic = pose_towards(eye + offset_m, aim + offset_m), intrinsic_matrix(*SIZE, 60.0)
         renderer.prepare(pose[:3, 3] - 60.0, pose[:3, 3] + 60.0)
-        frame = renderer.render(pose, intrinsic, None)
+        frame = renderer.render(pose, intrinsic, {})
         depth, kinds_seen, ids = traced(box_map, plane_z_m(box_map), pose, intrinsic)
         inner = away_from_silhouettes(depth, ids)
         np.testing.assert_array_equal(frame.ids[inner], ids[inner])
@@ -296,7 +294,7 @@ def test_depth_of_the_default_renderer_to_a_fifth_of_a_millimetre(
 
 def test_types_ranges_and_sky(renderer):
     pose = pose_towards((0.0, -20.0, 6.0), (0.0, 40.0, 14.0))
-    frame = renderer.render(pose, intrinsic_matrix(*SIZE, 90.0), None)
+    frame = renderer.render(pose, intrinsic_matrix(*SIZE, 90.0), {})
     h, w = SIZE[1], SIZE[0]
     assert (frame.rgb.shape, frame.rgb.dtype) == ((h, w, 3), np.uint8)
     assert (frame.depth.shape, frame.depth.dtype) == ((h, w), np.float32)
@@ -321,7 +319,7 @@ def test_what_stands_as_far_as_the_sky_is_sky(renderer_name):
     renderer, far = opened(renderer_name, box_map), 0
     for height_m in np.arange(180.0, 320.0, 10.0):
         pose = pose_towards((0.0, 0.0, height_m), (0.0, 990.0, 0.0))
-        frame = renderer.render(pose, intrinsic_matrix(*SIZE, 8.0), None)
+        frame = renderer.render(pose, intrinsic_matrix(*SIZE, 8.0), {})
         is_sky = frame.kinds == KINDS["Sky"]
         assert frame.depth.max() <= FAR_M
         np.testing.assert_array_equal(is_sky, frame.depth == SKY_DEPTH_M)
@@ -333,7 +331,7 @@ def test_what_stands_as_far_as_the_sky_is_sky(renderer_name):
 
 def test_the_person_is_drawn_in_the_projected_box(renderer):
     pose, camera = pose_towards((-4.0, -12.0, 6.0), HIP), Camera(*SIZE, intrinsic_matrix(*SIZE, 60.0))
-    frame = renderer.render(pose, camera.intrinsic, WALKER)
+    frame = renderer.render(pose, camera.intrinsic, {PERSON_ID: WALKER})
     view = view_target(HIP, pose, camera)
     person = frame.ids == PERSON_ID
     assert (frame.kinds[person] == KINDS["Pedestrians"]).all()
@@ -347,7 +345,7 @@ def test_the_person_is_drawn_in_the_projected_box(renderer):
     assert rows.max() - rows.min() > 0.7 * (y1 - y0)
     assert rendered_visibility(frame, HIP, view, pose, camera)[0] > 0.98
     behind = pose_towards((10.0, 40.0, 3.0), HIP)  # a house in between
-    hidden = renderer.render(behind, camera.intrinsic, WALKER)
+    hidden = renderer.render(behind, camera.intrinsic, {PERSON_ID: WALKER})
     assert rendered_visibility(hidden, HIP, view_target(HIP, behind, camera), behind, camera) == (0.0, 0.0, 1.0)
     assert not (hidden.ids == PERSON_ID).any()
 
@@ -362,7 +360,7 @@ def test_a_person_under_a_tree_is_seen_from_the_side_and_hidden_from_above(rende
     seen = {}
     for name, eye in {"side": (0.0, -12.0, 1.2), "above": (0.0, -1.0, 15.0), "through": (-14.0, 0.0, 0.9)}.items():
         pose = pose_towards(eye, hip)
-        frame = renderer.render(pose, camera.intrinsic, walker)
+        frame = renderer.render(pose, camera.intrinsic, {PERSON_ID: walker})
         score = rendered_visibility(frame, hip, view_target(hip, pose, camera), pose, camera)[0]
         seen[name] = score, int(np.count_nonzero(frame.ids == PERSON_ID))
         assert set(np.unique(frame.ids)) >= {1, 2}
@@ -376,16 +374,16 @@ def test_a_person_under_a_tree_is_seen_from_the_side_and_hidden_from_above(rende
 def test_a_pose_that_is_not_finite_is_refused(renderer):
     intrinsic = intrinsic_matrix(*SIZE, 60.0)
     with pytest.raises(RenderError, match="not finite"):
-        renderer.render(np.full((4, 4), np.nan), intrinsic, None)
+        renderer.render(np.full((4, 4), np.nan), intrinsic, {})
     with pytest.raises(RenderError, match="not finite"):
-        renderer.render(np.eye(4), intrinsic + np.inf, None)
+        renderer.render(np.eye(4), intrinsic + np.inf, {})
 
 
 def test_the_look_is_in_the_picture(renderer_name):
     brightness = []
     for look in (Look(), Look(exposure=0.3), Look(haze_m=10.0), Look(sun_elevation_deg=10.0)):
         renderer = open_renderer(renderer_name, street(), *SIZE, look)
-        frame = renderer.render(pose_towards(VIEWS[0][0], HIP), intrinsic_matrix(*SIZE, 60.0), None)
+        frame = renderer.render(pose_towards(VIEWS[0][0], HIP), intrinsic_matrix(*SIZE, 60.0), {})
         brightness.append(float(frame.rgb[frame.kinds != KINDS["Sky"]].mean()))
         renderer.close()
     assert len({round(value) for value in brightness}) == len(brightness), brightness
@@ -439,7 +437,7 @@ def test_a_renderer_may_be_dropped_on_another_thread_in_the_midst_of_a_frame(mon
 
 
 def _digest(renderer) -> str:
-    frame = renderer.render(pose_towards(VIEWS[0][0], HIP), intrinsic_matrix(*SIZE, 60.0), WALKER)
+    frame = renderer.render(pose_towards(VIEWS[0][0], HIP), intrinsic_matrix(*SIZE, 60.0), {PERSON_ID: WALKER})
     return hashlib.sha256(b"".join(a.tobytes() for a in (frame.rgb, frame.depth, frame.kinds, frame.ids))).hexdigest()
 
 
@@ -522,29 +520,28 @@ def test_a_second_renderer_without_libraries_names_the_packages(monkeypatch):
         open_renderer("pyrender", street(), *SIZE)
 
 
-BESIDE = PosedBystander(
-    other_id(0), PosedPerson(HIP + np.array([1.2, 0.6, 0.0]), 0.2, 0.4, 1.0, choose_clothes(np.random.default_rng(4)))
-)
-CAR = PosedBystander(other_id(1), PosedCar(HIP + np.array([-5.0, -1.0, -0.15]), 0.6, (2.2, 0.9, 0.75), 0.3))
+BESIDE = PosedPerson(HIP + np.array([1.2, 0.6, 0.0]), 0.2, 0.4, 1.0, choose_clothes(np.random.default_rng(4)))
+APART = PosedPerson(HIP + np.array([-5.0, -1.0, 0.0]), 0.6, 0.0, 0.0, choose_clothes(np.random.default_rng(5)))
+OTHERS = {other_id(0): BESIDE, other_id(1): APART}
 
 
 def test_others_are_drawn_with_ids_of_their_own_inside_their_boxes(renderer):
     pose, camera = pose_towards((-4.0, -14.0, 9.0), HIP), Camera(*SIZE, intrinsic_matrix(*SIZE, 60.0))
-    alone = renderer.render(pose, camera.intrinsic, WALKER)
-    frame = renderer.render(pose, camera.intrinsic, WALKER, [BESIDE, CAR])
+    alone = renderer.render(pose, camera.intrinsic, {PERSON_ID: WALKER})
+    frame = renderer.render(pose, camera.intrinsic, {PERSON_ID: WALKER, **OTHERS})
     np.testing.assert_array_equal(frame.ids == PERSON_ID, alone.ids == PERSON_ID)
-    for other, kind, half in ((BESIDE, "Pedestrians", PERSON_HALF_EXTENTS_M), (CAR, "Car", (2.2, 0.9, 0.75))):
-        mask = frame.ids == other.instance_id
+    for instance_id, other in OTHERS.items():
+        mask = frame.ids == instance_id
         assert mask.sum() > 60
-        assert (frame.kinds[mask] == KINDS[kind]).all()
-        corners = box_corners(other.center_m, np.array(half), other.body.heading_rad)
+        assert (frame.kinds[mask] == KINDS["Pedestrians"]).all()
+        corners = box_corners(other.hip_m, np.array(PERSON_HALF_EXTENTS_M), other.heading_rad)
         uv, z = project(corners, pose, camera.intrinsic)
         rows, columns = np.nonzero(mask)
         assert (uv.min(axis=0) - 4 <= [columns.min(), rows.min()]).all()
         assert (uv.max(axis=0) + 4 >= [columns.max(), rows.max()]).all()
         assert ((frame.depth[mask] > z.min() - 0.2) & (frame.depth[mask] < z.max() + 0.2)).all()
-        assert mask.sum() > 0.25 * np.prod(np.ptp(uv, axis=0)) * (0.5 if kind == "Pedestrians" else 1.0)
-    untouched = ~np.isin(frame.ids, [BESIDE.instance_id, CAR.instance_id])
+        assert mask.sum() > 0.25 * np.prod(np.ptp(uv, axis=0)) * 0.5
+    untouched = ~np.isin(frame.ids, [*OTHERS])
     np.testing.assert_array_equal(frame.depth[untouched], alone.depth[untouched])
     np.testing.assert_array_equal(frame.ids[untouched], alone.ids[untouched])
 
@@ -553,11 +550,11 @@ def test_who_stands_before_the_target_hides_it_and_is_told_from_the_map(renderer
     camera = Camera(*SIZE, intrinsic_matrix(*SIZE, 40.0))
     pose = pose_towards(HIP + np.array([0.0, -12.0, 0.3]), HIP)
     view = view_target(HIP, pose, camera)
-    before = PosedBystander(other_id(1), PosedCar(HIP + np.array([0.0, -4.0, -0.15]), 0.0, (2.2, 0.9, 0.75), 0.3))
-    ids = np.array([before.instance_id])
+    before = {other_id(1): replace(APART, hip_m=HIP + np.array([0.0, -4.0, 0.0]))}
+    ids = np.array([*before])
     shares = []
-    for others in ((), (before,)):
-        frame = renderer.render(pose, camera.intrinsic, WALKER, others)
+    for others in ({}, before):
+        frame = renderer.render(pose, camera.intrinsic, {PERSON_ID: WALKER, **others})
         score, by_others, by_map = rendered_visibility(frame, HIP, view, pose, camera, ids)
         assert score + by_others + by_map == pytest.approx(1.0), "all of the box lies in the image"
         shares.append((score, by_others, by_map))
@@ -566,7 +563,7 @@ def test_who_stands_before_the_target_hides_it_and_is_told_from_the_map(renderer
     assert 0.2 < shares[1][1] < 0.95
     assert shares[1][2] == shares[0][2]
     behind = pose_towards((10.0, 40.0, 3.0), HIP)  # a house in between
-    frame = renderer.render(behind, camera.intrinsic, WALKER, (before,))
+    frame = renderer.render(behind, camera.intrinsic, {PERSON_ID: WALKER, **before})
     view = view_target(HIP, behind, camera)
     assert rendered_visibility(frame, HIP, view, behind, camera, ids) == (0.0, 0.0, 1.0)
 
@@ -575,19 +572,19 @@ def test_nobody_else_has_the_ids_of_others(renderer_name):
     boxes = make_box_map([(0.0, 4.0, 1.0)], [(1.0, 1.0, 1.0)], np.zeros((1, 3)), [KINDS["Buildings"]], [MAX_BOX_ID])
     pose, intrinsic = pose_towards((0.0, -10.0, 3.0), (0.0, 2.0, 1.0)), intrinsic_matrix(*SIZE, 60.0)
     renderer = opened(renderer_name, boxes, num_others=2)
-    car = replace(CAR, body=replace(CAR.body, center_m=np.array([4.0, 0.0, 0.75])))
-    ids = np.unique(renderer.render(pose, intrinsic, None, [car]).ids)
+    other = replace(APART, hip_m=np.array([4.0, 0.0, 0.9]))
+    ids = np.unique(renderer.render(pose, intrinsic, {other_id(1): other}).ids)
     renderer.close()
     assert ids.tolist() == [NO_INSTANCE, 1, other_id(1)]
 
 
 def with_others(folder: Path, num: int, trace: DroneTrace) -> Path:
-    """Others of a flight: one who walks 1 m beside the person, and a car that stands off; of `num` times."""
+    """Others of a flight: one who walks 1 m beside the person, and one who stands off; of `num` times."""
     folder.mkdir(exist_ok=True)
     feet = trace.targets_m[:num] - [0.0, 0.0, 0.9]
-    beside = Bystander("Pedestrians", feet + np.array([0.2, -1.0, 0.0]), np.zeros(num))
-    car = Bystander("Car", np.tile(feet[0] + [1.0, 3.5, 0.0], (num, 1)), np.full(num, 0.3))
-    write_bystanders(folder / "others.json", [Bystanders(trace.path_id, [beside, car])], {})
+    beside = Bystander(feet + np.array([0.2, -1.0, 0.0]), np.zeros(num))
+    apart = Bystander(np.tile(feet[0] + [1.0, 3.5, 0.0], (num, 1)), np.full(num, 0.3))
+    write_bystanders(folder / "others.json", [Bystanders(trace.path_id, [beside, apart])], {})
     return folder / "others.json"
 
 
@@ -602,7 +599,7 @@ def test_a_flight_with_others_tells_of_them_in_every_frame(renderer_name, tmp_pa
         for i in range(len(flight)):
             meta, ids = read_meta(flight.frame_folder(i)), read_instance(flight.frame_folder(i))[1]
             assert [other.instance_id for other in meta.others.others] == [MAX_BOX_ID, MAX_BOX_ID - 1]
-            assert [other.semantic_id for other in meta.others.others] == [KINDS["Pedestrians"], KINDS["Car"]]
+            assert [other.semantic_id for other in meta.others.others] == [KINDS["Pedestrians"]] * 2
             assert [other.num_pixels for other in meta.others.others] == [(ids == other_id(k)).sum() for k in (0, 1)]
             assert meta.target.num_pixels == int((ids == PERSON_ID).sum()) > 0
             hidden = meta.others.target_hidden_by_others + meta.others.target_hidden_by_map

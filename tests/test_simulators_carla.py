@@ -346,14 +346,14 @@ def _drawn(port: int) -> tuple:
     person = PosedPerson(np.array([4.0, -3.0, 0.90625]), 0.0, 0.0, 1.0, clothes)
     for own in ({"settings": build(CarlaRenderConfig, {"port": port, **QUICK}, "test")}, {}):
         renderer = open_renderer("carla" if own else "gl", found, 160, 90, **own)
-        frames.append([renderer.render(pose, lens(160, 90, 60.0), person)])
+        frames.append([renderer.render(pose, lens(160, 90, 60.0), {PERSON_ID: person})])
         if own:
-            near = renderer.render(pose, lens(160, 90, 30.0), person)  # other cameras
+            near = renderer.render(pose, lens(160, 90, 30.0), {PERSON_ID: person})  # other cameras
             with pytest.raises(RenderError, match=r"cannot render with this intrinsic matrix.*square pixels"):
-                renderer.render(pose, lens(160, 90, 60.0) + np.eye(3)[0], None)
+                renderer.render(pose, lens(160, 90, 60.0) + np.eye(3)[0], {})
         for weather in (RAINY_NIGHT, None):
             renderer.prepare(*found.bounds(), weather)
-            frames[-1].append(renderer.render(pose, lens(160, 90, 60.0), None))
+            frames[-1].append(renderer.render(pose, lens(160, 90, 60.0), {}))
             if own and weather:
                 told = carla.Client("127.0.0.1", port).get_world().get_weather()
         renderer.close()
@@ -388,8 +388,8 @@ def _after_another_client(port: int) -> tuple:
     renderer = open_renderer("carla", street(), 160, 90, settings=settings)
     renderer.prepare(*street().bounds(), None)
     pose = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-32.5, 60.0, 0.0]))
-    fair = renderer.render(pose, intrinsic_matrix(160, 90, 60.0), None)
-    renderer.render(pose, intrinsic_matrix(160, 90, 60.0), None)  # a client knows a place one tick later
+    fair = renderer.render(pose, intrinsic_matrix(160, 90, 60.0), {})
+    renderer.render(pose, intrinsic_matrix(160, 90, 60.0), {})  # a client knows a place one tick later
     places = [renderer._spectator.get_transform().location]
     renderer.close()
     world.wait_for_tick()
@@ -403,7 +403,7 @@ def test_what_another_client_left_neither_stops_nor_changes_pictures(tmp_path):
         mean, (camera_m, left_m), weather = as_client(_after_another_client, port)
     gl = open_renderer("gl", street(), 160, 90)
     pose = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-32.5, 60.0, 0.0]))
-    assert mean == pytest.approx(gl.render(pose, intrinsic_matrix(160, 90, 60.0), None).rgb.mean(), abs=3.0)
+    assert mean == pytest.approx(gl.render(pose, intrinsic_matrix(160, 90, 60.0), {}).rgb.mean(), abs=3.0)
     gl.close()
     assert camera_m == pytest.approx((-1.0, 9.5, 5.5))
     assert left_m == pytest.approx((1.0, 2.0, 3.0))
@@ -418,7 +418,7 @@ renderer = t.open_renderer("carla", t.street(), 160, 90, settings=settings)
 renderer.prepare(*t.street().bounds(), t.RAINY_NIGHT)
 person = t.PosedPerson(np.array([4.0, -3.0, 0.9]), 0.0, 0.0, 1.0, t.clothes_of("walker.pedestrian.0001"))
 pose = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-22.5, 60.0, 0.0]))
-renderer.render(pose, intrinsic_matrix(160, 90, 60.0), person)
+renderer.render(pose, intrinsic_matrix(160, 90, 60.0), {t.PERSON_ID: person})
 print("drawn", flush=True)
 time.sleep(600)
 """

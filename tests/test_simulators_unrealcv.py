@@ -25,7 +25,7 @@ from cosfly.maps import unrealcv_export
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig, level_map
-from cosfly.render.contract import PERSON_ID, PosedBystander, PosedCar, PosedPerson, other_id
+from cosfly.render.contract import PERSON_ID, PosedPerson, other_id
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
@@ -201,20 +201,20 @@ def test_a_tree_is_the_embedded_renderers_by_recursive_diff(tmp_path):
         assert schema_of(meta.model_dump()) == schema_of(their_meta.model_dump())
 
 
-def test_people_and_cars_stand_where_they_are_and_the_lens_changes():
+def test_people_stand_where_they_are_and_the_lens_changes():
     clothes = clothes_of("Base_User_Agent_C")
     pose = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-32.5, 60.0, 0.0]))
     person = PosedPerson(np.array([4.0, -3.0, 0.90625]), 0.0, 0.0, 1.0, clothes)
-    car = PosedBystander(other_id(0), PosedCar(np.array([1.0, -4.0, 0.75]), 1.0, (2.25, 0.9, 0.75), 0.3))
+    both = {PERSON_ID: person, other_id(0): PosedPerson(np.array([1.0, -4.0, 0.90625]), 1.0, 0.0, 0.0, clothes)}
     frames = []
     with beside(street()) as port:
         ours = opened(port, exported())
         theirs = open_renderer("gl", exported(), 160, 90, num_others=4)
         for renderer in (ours, theirs):
-            frames.append(renderer.render(pose, intrinsic_matrix(160, 90, 60.0), person, [car]))
-        near = ours.render(pose, intrinsic_matrix(160, 90, 30.0), person)
+            frames.append(renderer.render(pose, intrinsic_matrix(160, 90, 60.0), both))
+        near = ours.render(pose, intrinsic_matrix(160, 90, 30.0), {PERSON_ID: person})
         with pytest.raises(RenderError, match=r"cannot render with this intrinsic matrix.*square pixels"):
-            ours.render(pose, intrinsic_matrix(160, 90, 60.0) + np.eye(3)[0], None)
+            ours.render(pose, intrinsic_matrix(160, 90, 60.0) + np.eye(3)[0], {})
         ours.close()
         theirs.close()
     for number in (PERSON_ID, other_id(0)):
@@ -241,7 +241,7 @@ def test_a_camera_that_falls_is_found(monkeypatch):
         pose = world_from_camera(np.array([-1.0, -9.5, 12.5]), np.array([-32.5, 60.0, 0.0]))
         told = rf"127\.0\.0\.1:{port}, street: the camera is not at the requested.*0\.6 m over the ground.*12\.5 m over"
         with pytest.raises(RenderError, match=told):
-            renderer.render(pose, intrinsic_matrix(160, 90, 60.0), None)
+            renderer.render(pose, intrinsic_matrix(160, 90, 60.0), {})
         renderer.close()
 
 

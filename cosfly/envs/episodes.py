@@ -21,7 +21,6 @@ from cosfly.geometry.axes import intrinsic_matrix, project, world_from_camera
 from cosfly.geometry.kernels import BoxIndex, obstacle_index, visibility
 from cosfly.maps.synthetic import PRESETS, SyntheticConfig, load
 from cosfly.pedestrians.bystanders import bystanders_of
-from cosfly.pedestrians.lanes import Lane, lanes_of
 from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, walkable_ground
 from cosfly.planners.contract import PlanConfig
@@ -48,10 +47,10 @@ TRIES = 40  # pedestrian trajectories until one can be an episode
 PACE = {"walk": 0.4, "stop_and_look": 0.2, "hurry": 0.1, "fits_and_starts": 0.2, "turn_back": 0.1}
 _ALONE = PedestriansConfig(ground="paved", road_cost=20, pace=PACE, hurry_speed_mps=2.0)
 
-# Environment -> pedestrians and traffic.
+# Environment -> pedestrians.
 TASKS = {
     "cosfly/Follow-v0": _ALONE,
-    "cosfly/Distracted-v0": _ALONE.model_copy(update={"others": 8, "look_alikes": 3, "traffic": 2}),
+    "cosfly/Distracted-v0": _ALONE.model_copy(update={"others": 8, "look_alikes": 3}),
     "cosfly/Reacquire-v0": _ALONE,
 }
 REACQUIRES = "cosfly/Reacquire-v0"
@@ -113,7 +112,6 @@ class BenchmarkWorld:
     boxes: BoxMap  # that are drawn
     simplified: BoxMap
     ground: WalkableGround
-    lanes: list[Lane]
     obstacles: BoxIndex
     screens: BoxIndex
     solids: BoxIndex  # that are drawn, without plants, whose foliage has gaps
@@ -126,7 +124,7 @@ class BenchmarkWorld:
 
     def airspace(self, task: str, size_px: tuple[int, int] = SIZE_PX, like: Airspace | None = None) -> Airspace:
         """Open a renderer for a task; like: another town of this task and size, which shares its GL context."""
-        num_others = TASKS[task].others + TASKS[task].traffic
+        num_others = TASKS[task].others
         cfg = RenderConfig(width_px=size_px[0], height_px=size_px[1], fovs_deg=(FOV_DEG,))
         return Airspace(
             cfg, self.boxes, self.simplified, map_sha256=self.sha256, seed=self.town.seed, num_others=num_others,
@@ -144,7 +142,6 @@ def world_of(town: BenchmarkTown) -> BenchmarkWorld:
         boxes=boxes,
         simplified=simplified,
         ground=walkable_ground(simplified, _ALONE, where=town.name),
-        lanes=lanes_of(simplified),
         obstacles=obstacle_index(simplified),
         screens=screens_of(simplified),
         solids=obstacle_index(boxes.select(~boxes.is_any_of({KINDS["Vegetation"]}))),
@@ -219,12 +216,12 @@ def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisod
     plan = replace(plan.part(number, begin, end), rotations_deg=rotations_deg[begin:end])
     plan = replace(plan, time_s=plan.time_s - plan.time_s[0])
     bystanders = tuple[Bystander, ...]()
-    if cfg.has_others:
+    if cfg.others:
         rng = rng_for(town.seed, "pedestrians", f"{name}/others")
         positions_m = target.positions_m[begin:end]
         met = replace(
             target, polyline_m=positions_m[:, :2], time_s=plan.time_s, positions_m=positions_m,
             speeds_mps=target.speeds_mps[begin:end],
         )  # fmt: skip
-        bystanders = tuple(bystanders_of(met, world.ground, world.lanes, cfg, rng).others)
+        bystanders = tuple(bystanders_of(met, world.ground, cfg, rng).others)
     return BenchmarkEpisode(task, world, number, plan, num_lead, bystanders)

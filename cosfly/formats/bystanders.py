@@ -1,9 +1,8 @@
-"""`others.json`, the second product of step 3: people and cars that move during a pedestrian trajectory."""
+"""`others.json`, the second product of step 3: people who move during a pedestrian trajectory."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,52 +16,27 @@ BYSTANDERS_FILE = "others.json"
 BYSTANDERS_FORMAT = FileFormat("cosfly.others", "1.0", "others")
 
 
-@dataclass(frozen=True)
-class Build:
-    """Size of a kind. half_extents_m: Of its box, x along the heading. disc_offsets_m: Positions along the heading of
-    discs of one radius on the ground that cover the box."""
-
-    half_extents_m: tuple[float, float, float]
-    disc_radius_m: float
-    disc_offsets_m: tuple[float, ...]
-
-
-# Two people are never nearer than 0.6 m from middle to middle. Three discs of 1.2 m cover a car of 4.4 m by 1.8 m.
-BUILDS = {
-    "Pedestrians": Build(PERSON_HALF_EXTENTS_M, 0.3, (0.0,)),
-    "Car": Build((2.2, 0.9, 0.75), 1.2, (-1.45, 0.0, 1.45)),
-}
+KIND = "Pedestrians"
+PERSON_RADIUS_M = 0.3  # of the disc on the ground that covers a person
 
 
 @dataclass(frozen=True)
 class Bystander:
-    """A pedestrian or car next to the target. positions_m: (n, 3), on the ground below the middle. headings_rad: (n,).
+    """A pedestrian next to the target. positions_m: (n, 3), on the ground below the middle. headings_rad: (n,).
     is_look_alike: A hard distractor, which differs from the target in one garment."""
 
-    kind: str
     positions_m: np.ndarray
     headings_rad: np.ndarray
     is_look_alike: bool = False
 
     @property
-    def build(self) -> Build:
-        return BUILDS[self.kind]
-
-    @property
     def centers_m(self) -> np.ndarray:
         """Middles of the box, (n, 3)."""
-        return self.positions_m + np.array([0.0, 0.0, self.build.half_extents_m[2]])
-
-    @cached_property
-    def discs_m(self) -> np.ndarray:
-        """Middles of the discs on the ground, (n, d, 2)."""
-        ahead = np.stack([np.cos(self.headings_rad), np.sin(self.headings_rad)], axis=1)
-        return self.positions_m[:, None, :2] + np.array(self.build.disc_offsets_m)[None, :, None] * ahead[:, None]
+        return self.positions_m + np.array([0.0, 0.0, PERSON_HALF_EXTENTS_M[2]])
 
     def gap_to_person_m(self, person_m: np.ndarray) -> float:
-        """Return the gap between its discs at the first time and a person at (2 or 3,) m; negative: overlap."""
-        distance_m = np.linalg.norm(self.discs_m[0] - person_m[:2], axis=1).min()
-        return float(distance_m) - self.build.disc_radius_m - BUILDS["Pedestrians"].disc_radius_m
+        """Return the gap between its disc at the first time and a person at (2 or 3,) m; negative: overlap."""
+        return float(np.linalg.norm(self.positions_m[0, :2] - person_m[:2])) - 2.0 * PERSON_RADIUS_M
 
     def at(self, i: int) -> Bystander:
         """Return the bystander at one time."""
@@ -75,21 +49,16 @@ class Bystander:
     def as_json(self) -> dict:
         flags = {"look_alike": True} if self.is_look_alike else {}
         yaw = rounded(np.degrees(self.headings_rad), 3)
-        return {"kind": self.kind, **flags, **as_columns(self.positions_m, "xyz"), "yaw": yaw}
+        return {"kind": KIND, **flags, **as_columns(self.positions_m, "xyz"), "yaw": yaw}
 
     @classmethod
     def from_json(cls, record: dict, where: str) -> Bystander:
-        kind = record.get("kind")
-        if not isinstance(kind, str) or kind not in BUILDS:
-            raise InputError(
-                "the kind of the bystander is unknown",
-                where=f"{where}.kind",
-                got=shown(kind),
-                expected=" or ".join(BUILDS),
-            )
+        if (kind := record.get("kind")) != KIND:
+            what = "the kind of the bystander is unknown"
+            raise InputError(what, where=f"{where}.kind", got=shown(kind), expected=KIND)
         positions_m = columns(record, "xyz", where)
         yaw = column(record, "yaw", where, len(positions_m))
-        return cls(kind, positions_m, np.radians(yaw), record.get("look_alike") is True)
+        return cls(positions_m, np.radians(yaw), record.get("look_alike") is True)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.bystanders import Bystander
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.geometry.axes import rotation_matrices
 from cosfly.runtime.compiled import njit
 
@@ -453,4 +454,4 @@ def distances_to_boxes_m(points_m: np.ndarray, other: Bystander) -> np.ndarray:
     offset = points_m - other.centers_m
     cos, sin = np.cos(other.headings_rad), np.sin(other.headings_rad)
     local = np.stack([offset[:, 0] * cos + offset[:, 1] * sin, offset[:, 1] * cos - offset[:, 0] * sin, offset[:, 2]])
-    return np.linalg.norm(np.maximum(np.abs(local) - np.array(other.build.half_extents_m)[:, None], 0.0), axis=0)
+    return np.linalg.norm(np.maximum(np.abs(local) - np.array(PERSON_HALF_EXTENTS_M)[:, None], 0.0), axis=0)

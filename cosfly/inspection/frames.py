@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cosfly.formats.bystanders import BUILDS, Bystander
+from cosfly.formats.bystanders import KIND, Bystander
 from cosfly.formats.frames import (
     DEPTH_NPY,
     FILE_NAMES,
@@ -169,13 +169,12 @@ def check_bystanders(
     nearest_m = np.inf
     for i, frame in frames.items():
         for line in frame.others:
-            kind = KIND_NAMES.get(line.semantic_id, "")
-            if kind not in BUILDS:
+            if line.semantic_id != KINDS[KIND]:
                 where = f"meta.json of frame {i}: others"
-                report.error("broken_annotation", where, f"semantic_id {line.semantic_id}", " or ".join(BUILDS))
+                report.error("broken_annotation", where, f"semantic_id {line.semantic_id}", f"{KINDS[KIND]}, {KIND}")
                 continue
-            feet_m = line.world_location - np.array([0.0, 0.0, BUILDS[kind].half_extents_m[2]])
-            bystander = Bystander(kind, feet_m[None], np.array([line.heading_rad]))
+            feet_m = line.world_location - np.array([0.0, 0.0, PERSON_HALF_EXTENTS_M[2]])
+            bystander = Bystander(feet_m[None], np.array([line.heading_rad]))
             distance_m = float(distances_to_boxes_m(track.positions_m[i], bystander)[0])
             nearest_m = min(nearest_m, distance_m)
             if distance_m < clearance_min_m - CLEARANCE_TOLERANCE_M:

@@ -22,7 +22,6 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory, pace_field, pa
 from cosfly.formats.roi import read_roi
 from cosfly.pedestrians.astar import route_cost
 from cosfly.pedestrians.bystanders import bystanders_of
-from cosfly.pedestrians.lanes import Lane, lanes_of
 from cosfly.pedestrians.speed_model import PACES, TimedRoute, speeds_at, take_pace
 from cosfly.pedestrians.walkable import (
     CROSSING,
@@ -115,19 +114,19 @@ class _PedestrianRecord(BaseModel):
     path: dict[str, Any]
     retries: dict[str, int]
     seconds: dict[str, float]
-    bystanders: dict[str, Any] = {}  # where there are bystanders or cars
+    bystanders: dict[str, Any] = {}  # where there are bystanders
 
 
-def make_worker(cfg: PedestriansConfig, seed: int, ground: WalkableGround, lanes: list[Lane]) -> Work:
-    """Return the function that makes one trajectory, and its bystanders and cars where the settings ask for them."""
+def make_worker(cfg: PedestriansConfig, seed: int, ground: WalkableGround) -> Work:
+    """Return the function that makes one trajectory, and its bystanders where the settings ask for them."""
 
     def work(item: Item) -> Outcome:
         pedestrian = make_pedestrian(item.item_id, ground, cfg, rng_for(seed, STAGE, item.item_id), item.payload)
         trajectory = pedestrian.trajectory
         record = {"path": trajectory.as_json(), "retries": pedestrian.retries, "seconds": pedestrian.seconds}
-        if cfg.has_others:
+        if cfg.others:
             rng = rng_for(seed, STAGE, f"{item.item_id}/others")
-            record["bystanders"] = bystanders_of(trajectory, ground, lanes, cfg, rng).as_json()
+            record["bystanders"] = bystanders_of(trajectory, ground, cfg, rng).as_json()
         return Outcome(record)
 
     return work
@@ -160,19 +159,15 @@ def report(
     return {**REPORT_FORMAT.header, "ground": ground.counts, "paths": rows, "failed": failed, "total": total}
 
 
-def _write_bystanders(path: Path, records: list[dict], header: dict, cfg: PedestriansConfig) -> dict[str, dict]:
-    """Write `others.json`; return how many were requested and placed, by kind; warn where some are missing."""
+def _write_bystanders(path: Path, records: list[dict], header: dict, cfg: PedestriansConfig) -> dict[str, int]:
+    """Write `others.json`; return how many bystanders were requested and placed; warn where some are missing."""
     items = [Bystanders.from_json(record, f"{path.parent}: items.jsonl") for record in records]
     write_bystanders(path, items, header)
-    counts = {}
-    for kind, per_item in (("Pedestrians", cfg.others), ("Car", cfg.traffic)):
-        placed = sum(other.kind == kind for bystanders in items for other in bystanders.others)
-        counts[kind] = {"wanted": per_item * len(items), "placed": placed}
-        if placed < per_item * len(items):
-            log.warning(
-                "pedestrians: only %d of %d bystanders of kind %s could be placed", placed, per_item * len(items), kind
-            )
-    return counts
+    wanted = cfg.others * len(items)
+    placed = sum(len(bystanders.others) for bystanders in items)
+    if placed < wanted:
+        log.warning("pedestrians: only %d of %d bystanders could be placed", placed, wanted)
+    return {"wanted": wanted, "placed": placed}
 
 
 def run(
@@ -180,7 +175,7 @@ def run(
     watch: Watch = Watch(), resume: Resume = "if-same", roi: Path | None = None,
 ) -> Path:  # fmt: skip
     """Read `step2_simplified.json` (and `roi`, a region of interest); write `path.json`, a report and `paths.png`, and
-    `others.json` if there are bystanders or cars; return the path of `path.json`. Failed trajectories are counted.
+    `others.json` if there are bystanders; return the path of `path.json`. Failed trajectories are counted.
     """
     inputs = {"map": simplified_map} | ({"roi": roi} if roi else {})
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
@@ -195,9 +190,8 @@ def run(
     items = [Item(walk_id(k), pace) for k, pace in enumerate(paces_of(cfg.num_paths, cfg.pace, seed))]
     # Workers need the labels only; sending the rest takes time.
     lean = replace(ground, inflated=ground.grid, is_in_roi=None)
-    lanes = lanes_of(box_map) if cfg.traffic else []
     finished = run_items(
-        stage, items, make_worker, (cfg, seed, lean, lanes), workers=workers, watch=watch, label="trajectories"
+        stage, items, make_worker, (cfg, seed, lean), workers=workers, watch=watch, label="trajectories"
     )
     if not finished.tally.kept:
         raise stage.nothing_kept(finished.tally)
@@ -210,7 +204,7 @@ def run(
         retries = [result.retries for result in results]
         summary = report(ground, paths, retries, dict(sorted(finished.tally.failed.items())))
         write_paths(product, paths, {"map": box_map.name, "seed": seed, "settings": cfg.all_values()})
-        if cfg.has_others:
+        if cfg.others:
             header = {"map": box_map.name, "seed": seed, "dt_s": cfg.dt_s}
             outputs.append(out / BYSTANDERS_FILE)
             summary["others"] = _write_bystanders(outputs[-1], [result.bystanders for result in results], header, cfg)

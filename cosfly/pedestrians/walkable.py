@@ -86,17 +86,11 @@ class PedestriansConfig(Config):
     look_alikes: int = Field(
         0, ge=0, le=500, description="bystanders who wear the same as the target except for one item"
     )
-    traffic: int = Field(0, ge=0, le=500, description="cars around each trajectory, where the map has straight roads")
-    others_reach_m: ClassVar[float] = 40.0  # greatest distance of bystanders and cars from the trajectory, m
+    others_reach_m: ClassVar[float] = 40.0  # greatest distance of bystanders from the trajectory, m
     dt_s: float = Field(
         DT_S, ge=0.05, le=5, description="time step of trajectories, frames and windows (dt), s; counts of frames "
         "(caption.window) and the thresholds of labels are for 0.5",
     )  # fmt: skip
-
-    @property
-    def has_others(self) -> bool:
-        """Return whether there are bystanders or cars."""
-        return self.others + self.traffic > 0
 
     @field_validator("pace")
     @classmethod

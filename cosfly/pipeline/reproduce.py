@@ -411,7 +411,7 @@ def measure(
     boxes = folder / "maps/boxes_3d.json"
     simplified = folder / "simplify/step2_simplified.json"
     traces = folder / "plan/drone_trace.json"
-    only_targets = {"num_paths": num_pedestrians, "others": 0, "traffic": 0, "look_alikes": 0}
+    only_targets = {"num_paths": num_pedestrians, "others": 0, "look_alikes": 0}
     walking = cfg.pedestrians.model_copy(update=only_targets)
     paths = cosfly.pedestrians.stage.run(walking, simplified, out / "pedestrians", roi=cfg.roi, **options)
     plan = cfg.plan.model_copy(update={"styles": {FOLLOW: 1.0}})

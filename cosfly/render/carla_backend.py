@@ -18,8 +18,8 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.formats.kinds import KIND_NAMES, KINDS
 from cosfly.formats.weather import WeatherParams
-from cosfly.render.contract import NEAR_M, NO_INSTANCE, Frame, PosedCar, PosedPerson, far_as_sky, instance_ids
-from cosfly.render.simulator import Body, NoPictureError, ServerCommand, SimulatorRenderer, placement_of
+from cosfly.render.contract import NEAR_M, NO_INSTANCE, Frame, PosedPeople, PosedPerson, far_as_sky, instance_ids
+from cosfly.render.simulator import NoPictureError, ServerCommand, SimulatorRenderer, placement_of
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import dump_json
@@ -33,7 +33,6 @@ HEALTH_CHECK_S = 5.0  # between health checks, and for each
 HEALTH_CHECKS = 3  # in a row that fail: the worker ends
 PICTURE_SHARE = 1 / 3  # of timeout_s, in which a picture must come after its tick
 SENSORS = {"rgb": "rgb", "depth": "depth", "tags": "instance_segmentation"}
-MOVER_KINDS = ("Pedestrians", "Rider", "Car", "Truck", "Bus", "Motorcycle", "Bicycle")
 SAME_BOX_M = 0.05
 # Fixed exposure and no motion blur.
 RGB_ATTRIBUTES = {"exposure_mode": "manual", "motion_blur_intensity": "0.0", "motion_blur_max_distortion": "0.0"}
@@ -80,9 +79,8 @@ class CarlaRenderer(SimulatorRenderer):
                 world.apply_settings(settings)
                 self._library = world.get_blueprint_library()
                 self._cameras: dict[str, tuple[Any, queue.SimpleQueue]] = {}
-                self._movers: dict[int, Any] = {}
+                self._walkers: dict[int, Any] = {}
                 self._fov_deg = 0.0
-                self._sizes_m = dict[str, np.ndarray]()
                 self._ids = _ids_in_pictures(self._server, self._map, self._num_others)
         except Exception:
             self._guard.close()
@@ -122,9 +120,9 @@ class CarlaRenderer(SimulatorRenderer):
     # --- one trajectory --------------------------------------------------------------------------------------
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
-        """Set the weather, and remove all people and cars."""
+        """Set the weather, and remove all people."""
         self._weather = weather
-        for number in list(self._movers):
+        for number in list(self._walkers):
             self._remove(number)
         self._set_weather()
 
@@ -142,14 +140,14 @@ class CarlaRenderer(SimulatorRenderer):
 
     # --- one frame ----------------------------------------------------------------------------------------------------
 
-    def _frame(self, camera_pose: np.ndarray, fov_deg: float, bodies: dict[int, Body]) -> Frame:
+    def _frame(self, camera_pose: np.ndarray, fov_deg: float, people: PosedPeople) -> Frame:
         pose = self._transform(camera_pose[:3, 3], conventions.camera_rotation_deg(camera_pose))
         if fov_deg != self._fov_deg or not self._cameras:
             self._make_cameras(fov_deg, pose)
-        for number in self._movers.keys() - bodies.keys():
+        for number in self._walkers.keys() - people.keys():
             self._remove(number)
-        for number, body in bodies.items():
-            self._place(number, body)
+        for number, person in people.items():
+            self._place(number, person)
         for camera, _ in self._cameras.values():
             camera.set_transform(pose)
         self._spectator.set_transform(pose)
@@ -195,9 +193,8 @@ class CarlaRenderer(SimulatorRenderer):
             camera.listen(lambda image, inbox=inbox: inbox.put((image.frame, bytes(image.raw_data))))
             self._cameras[name] = camera, inbox
         carla = self._server.carla
-        for mover in self._movers.values():
-            if mover.type_id.startswith("walker."):
-                mover.apply_control(carla.WalkerControl(carla.Vector3D(1.0, 0.0, 0.0), 0.0, False))
+        for walker in self._walkers.values():
+            walker.apply_control(carla.WalkerControl(carla.Vector3D(1.0, 0.0, 0.0), 0.0, False))
         self._fov_deg = fov_deg
         until_s = time.monotonic() + PICTURE_SHARE * self._cfg.timeout_s
         while any(inbox.empty() for _, inbox in self._cameras.values()) and time.monotonic() < until_s:
@@ -210,54 +207,35 @@ class CarlaRenderer(SimulatorRenderer):
             camera.destroy()
         self._cameras.clear()
 
-    # --- people and cars ----------------------------------------------------------------------------------------------
+    # --- people -------------------------------------------------------------------------------------------------------
 
-    def _place(self, number: int, body: Body) -> None:
-        """Put a person or a car in place; a walker starts one step before it, because the tick moves it there."""
+    def _place(self, number: int, person: PosedPerson) -> None:
+        """Put a person one step before the place, because the tick moves walkers there."""
         carla = self._server.carla
-        actor = self._movers.get(number) or self._add(number, body)
-        position_m, turn_deg, ahead, speed_mps = placement_of(body, SIMULATED_STEP_S)
-        if isinstance(body, PosedPerson):
-            x, y, z = unreal_pose(ahead, turn_deg)[:3]
-            actor.apply_control(carla.WalkerControl(carla.Vector3D(x, y, z), speed_mps, False))
-        actor.set_transform(self._transform(position_m, turn_deg))
+        walker = self._walkers.get(number) or self._add(number, person)
+        position_m, turn_deg, ahead, speed_mps = placement_of(person, SIMULATED_STEP_S)
+        x, y, z = unreal_pose(ahead, turn_deg)[:3]
+        walker.apply_control(carla.WalkerControl(carla.Vector3D(x, y, z), speed_mps, False))
+        walker.set_transform(self._transform(position_m, turn_deg))
 
-    def _add(self, number: int, body: Body) -> Any:
-        """Spawn a person or a car, by clothes or size, and note the number of the actor in pictures."""
-        if isinstance(body, PosedPerson):
-            names = sorted(blueprint.id for blueprint in self._library.filter("walker.pedestrian.*"))
-            worn = dump_json(asdict(body.clothes.looks))
-            name = names[int(sha256_bytes(worn.encode())[:8], 16) % len(names)]
-        else:
-            sizes_m = self._vehicle_sizes()
-            name = min(sizes_m, key=lambda name: float(np.abs(sizes_m[name] - body.half_extents_m).sum()))
-        actor = self._movers[number] = self._spawned(self._library.find(name), self._far_up())
-        actor.set_collisions(False)
-        actor.set_enable_gravity(False)
-        if isinstance(body, PosedCar):
-            actor.set_simulate_physics(False)
-        self._note(actor, number)
-        return actor
+    def _add(self, number: int, person: PosedPerson) -> Any:
+        """Spawn a walker by a person's clothes, and note the number of the actor in pictures."""
+        names = sorted(blueprint.id for blueprint in self._library.filter("walker.pedestrian.*"))
+        worn = dump_json(asdict(person.clothes.looks))
+        name = names[int(sha256_bytes(worn.encode())[:8], 16) % len(names)]
+        walker = self._walkers[number] = self._spawned(self._library.find(name), self._far_up())
+        walker.set_collisions(False)
+        walker.set_enable_gravity(False)
+        self._note(walker, number)
+        return walker
 
     def _remove(self, number: int) -> None:
-        actor = self._movers.pop(number)
+        actor = self._walkers.pop(number)
         self._note(actor, NO_INSTANCE)
         actor.destroy()
 
     def _note(self, actor: Any, number: int) -> None:
-        for kind in MOVER_KINDS:
-            self._ids[KINDS[kind] << 16 | actor.id & ACTOR_BITS] = number
-
-    def _vehicle_sizes(self) -> dict[str, np.ndarray]:
-        """Return the half extents of every car's blueprint; a server knows them of spawned actors only."""
-        wheels = "number_of_wheels"
-        for blueprint in () if self._sizes_m else self._library.filter("vehicle.*"):
-            if not blueprint.has_attribute(wheels) or int(blueprint.get_attribute(wheels)) == 4:
-                actor = self._spawned(blueprint, self._far_up())
-                half = actor.bounding_box.extent
-                self._sizes_m[blueprint.id] = np.array([half.x, half.y, half.z])
-                actor.destroy()
-        return self._sizes_m
+        self._ids[KINDS["Pedestrians"] << 16 | actor.id & ACTOR_BITS] = number
 
     def _spawned(self, blueprint: Any, transform: Any) -> Any:
         actor = self._world.spawn_actor(blueprint, transform)
@@ -267,7 +245,7 @@ class CarlaRenderer(SimulatorRenderer):
     def _far_up(self) -> Any:
         """Return a free place over the map, so that no two spawned actors touch."""
         x, y, z = self._map.bounds()[1]
-        return self._transform(np.array([x + 10.0 * len(self._movers), y, z + SPAWN_M]), np.zeros(3))
+        return self._transform(np.array([x + 10.0 * len(self._walkers), y, z + SPAWN_M]), np.zeros(3))
 
     def _transform(self, position_m: np.ndarray, rotation_deg: np.ndarray) -> Any:
         carla = self._server.carla

@@ -3,14 +3,14 @@
 All renderers draw the same things in the same places, so that depth, kinds and ids do not depend on the renderer:
 
 - every box, or something of its kind that stays inside it, with its id of `instance_ids`; the person with PERSON_ID;
-  bystanders, people and cars, each with its own id from the caller (`other_id`);
+  bystanders, each with its own id from the caller (`other_id`);
 - of a tree that is one box a stem, and foliage only from `crown_low` of `plants_of` up: people walk under it;
 - a ground plane of Terrain (`ground_plane`), with NO_INSTANCE; sky where nothing is
   between NEAR_M and FAR_M (`far_as_sky`);
 - of coplanar surfaces the one of the higher layer, and within a layer always the same one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -82,30 +82,7 @@ class PosedPerson:
     clothes: Clothes
 
 
-@dataclass(frozen=True)
-class PosedCar:
-    """One car at one time."""
-
-    center_m: np.ndarray  # (3,) world, the middle of its box
-    heading_rad: float
-    half_extents_m: tuple[float, float, float]  # x along the heading
-    seed: float  # of its paint, in [0, 1)
-
-
-@dataclass(frozen=True)
-class PosedBystander:
-    """One bystander at one time, and its id in `instance.png`."""
-
-    instance_id: int
-    body: PosedPerson | PosedCar
-
-    @property
-    def center_m(self) -> np.ndarray:
-        """Return the middle of the box, (3,) world."""
-        return self.body.hip_m if isinstance(self.body, PosedPerson) else self.body.center_m
-
-
-Others = Sequence[PosedBystander]
+PosedPeople = Mapping[int, PosedPerson]  # by ids in `instance.png`: PERSON_ID is the target
 
 
 class Renderer(Protocol):
@@ -127,9 +104,7 @@ class Renderer(Protocol):
             RenderError: If this renderer draws no weather.
         """
 
-    def render(
-        self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None, others: Others = ()
-    ) -> Frame:
+    def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, people: PosedPeople) -> Frame:
         """Draw one frame from world_from_camera (4, 4), OpenCV axes, through K (3, 3) px.
 
         Raises:

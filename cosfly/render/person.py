@@ -1,5 +1,5 @@
-"""People and cars of a trajectory as renderers draw them: clothes, gait along the path and bystanders, and the figure
-of a walking person as solids for any renderer."""
+"""People of a trajectory as renderers draw them: clothes, gait along the path and bystanders, and the figure of a
+walking person as solids for any renderer."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from cosfly.formats.bystanders import Bystander
 from cosfly.formats.frames import BystanderMeta, BystandersMeta, tree_yaw
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.formats.people import COLORS, EMPTY_SHARE, FIGURES, GARMENTS, HAIR, Appearance, People
 from cosfly.geometry.axes import headings_of, rotation_matrices, rotation_matrix
 from cosfly.geometry.kernels import distances_to_boxes_m
-from cosfly.render.contract import Clothes, Frame, PosedBystander, PosedCar, PosedPerson, other_id
+from cosfly.render.contract import Clothes, Frame, PosedPeople, PosedPerson, other_id
 
 STRIDE_M = 1.35  # two steps
 SLOW_MPS = 0.7  # below this speed the swing shrinks, down to standing
@@ -99,24 +99,18 @@ SHARE_DIGITS = 6
 
 @dataclass(frozen=True)
 class DressedBystanders:
-    """The n bystanders of one trajectory, pedestrians and cars."""
+    """The n bystanders of one trajectory."""
 
     others: list[Bystander]
-    gaits: list[Gait]  # used for pedestrians only
-    clothes: list[Clothes]  # used for pedestrians only
-    seeds: np.ndarray  # (n,) in [0, 1), for the paint of cars
+    gaits: list[Gait]
+    clothes: list[Clothes]
 
     def __len__(self) -> int:
         return len(self.others)
 
     def people(self, target: Appearance) -> People:
-        """Return the appearance of the target and of every pedestrian among the bystanders."""
-        looks = {
-            other_id(number): self.clothes[number].looks
-            for number, other in enumerate(self.others)
-            if other.kind == "Pedestrians"
-        }
-        return People(target, looks)
+        """Return the appearance of the target and of every bystander."""
+        return People(target, {other_id(number): clothes.looks for number, clothes in enumerate(self.clothes)})
 
     def dressed(self, instance_id: int, looks: Appearance) -> DressedBystanders:
         """Return the bystanders with one of them in another appearance."""
@@ -125,19 +119,12 @@ class DressedBystanders:
         clothes[number] = replace(clothes[number], looks=looks)
         return replace(self, clothes=clothes)
 
-    def posed(self, i: int) -> list[PosedBystander]:
+    def posed(self, i: int) -> PosedPeople:
         """Return all bystanders in frame i."""
-        bystanders = []
-        for number, other in enumerate(self.others):
-            center_m = other.centers_m[i]
-            body: PosedPerson | PosedCar
-            if other.kind == "Pedestrians":
-                body = self.gaits[number].posed(i, center_m, self.clothes[number])
-            else:
-                heading_rad = float(other.headings_rad[i])
-                body = PosedCar(center_m, heading_rad, other.build.half_extents_m, float(self.seeds[number]))
-            bystanders.append(PosedBystander(other_id(number), body))
-        return bystanders
+        return {
+            other_id(number): self.gaits[number].posed(i, other.centers_m[i], self.clothes[number])
+            for number, other in enumerate(self.others)
+        }
 
     def meta(self, i: int, frame: Frame, hidden_by_others: float, hidden_by_map: float) -> BystandersMeta:
         """Return the annotation of the bystanders in frame i."""
@@ -148,10 +135,10 @@ class DressedBystanders:
             others=[
                 BystanderMeta(
                     instance_id=other_id(number),
-                    semantic_id=KINDS[other.kind],
+                    semantic_id=KINDS["Pedestrians"],
                     world_location=other.centers_m[i],
                     yaw=tree_yaw(float(np.degrees(other.headings_rad[i]))),
-                    half_extents_m=other.build.half_extents_m,
+                    half_extents_m=PERSON_HALF_EXTENTS_M,
                     num_pixels=int(pixels[other_id(number)]),
                 )
                 for number, other in enumerate(self.others)
@@ -167,7 +154,7 @@ class DressedBystanders:
         return any(other.at(i).gap_to_person_m(person_m) < 0.0 for other in self.others)
 
 
-NO_BYSTANDERS = DressedBystanders([], [], [], np.empty(0))
+NO_BYSTANDERS = DressedBystanders([], [], [])
 
 
 def dress_bystanders(
@@ -181,7 +168,7 @@ def dress_bystanders(
         while not target.differences(looks):
             looks = look_alike(target, rng) if other.is_look_alike else draw_appearance(rng)
         clothes.append(choose_clothes(rng, looks))
-    return DressedBystanders(others, gaits, clothes, rng.random(len(others)))
+    return DressedBystanders(others, gaits, clothes)
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------

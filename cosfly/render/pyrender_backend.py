@@ -15,9 +15,9 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import SKY_DEPTH_M, Look
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.weather import WeatherParams
-from cosfly.geometry.axes import rotation_matrices, rotation_matrix
+from cosfly.geometry.axes import rotation_matrices
 from cosfly.render import contract
-from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, Others, PosedBystander, PosedPerson
+from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedPeople, PosedPerson
 from cosfly.render.person import figure_of
 from cosfly.render.surfaces import are_solids, layers_of, solids_of
 from cosfly.runtime.errors import EnvironmentMissing, RenderError
@@ -34,11 +34,8 @@ COLORS = {
     "Water": (0.05, 0.12, 0.16), "RoadLines": (0.66, 0.66, 0.63), "Car": (0.30, 0.05, 0.05),
     "Truck": (0.05, 0.10, 0.26), "Bus": (0.62, 0.44, 0.05), "Poles": (0.18, 0.18, 0.19),
 }  # fmt: skip
-CAR_PAINTS = ((0.30, 0.05, 0.05), (0.05, 0.10, 0.26), (0.50, 0.50, 0.50), (0.04, 0.04, 0.045))
 
 LIMB_SHARE = (0.85, 0.85, 0.95)  # of its half sizes, that an untapered limb fills
-CABIN_WIDTH_SHARE = 0.8  # of a car's width
-CABIN_SHIFT_SHARE = -0.1  # of a car's half length, forwards
 TAGS, LIT_COLORS, DEPTH_BITS = 255, 128, 0  # what the fragment shader writes, by the red that pyrender passes to it
 
 
@@ -105,9 +102,7 @@ class PyrenderRenderer:
             fix = "set render.backend to `gl`, or render.weather_mode to `off`"
             raise RenderError("the renderer `pyrender` cannot draw weather", fix=fix)
 
-    def render(
-        self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None, others: Others = ()
-    ) -> Frame:
+    def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, people: PosedPeople) -> Frame:
         """Draw one frame, as the contract says."""
         contract.check_pose(camera_pose, intrinsic)
         import pyrender
@@ -117,9 +112,8 @@ class PyrenderRenderer:
         pose[:3, 3] -= self._origin
         lens = [intrinsic[0, 0], intrinsic[1, 1], intrinsic[0, 2], intrinsic[1, 2]]
         added = [self._scene.add(pyrender.IntrinsicsCamera(*lens, NEAR_M, FAR_M), pose=pose)]
-        target = [] if person is None else [PosedBystander(contract.PERSON_ID, person)]
-        for mover in (*target, *others):
-            added.append(self._scene.add(self._mesh(_mover_triangles(mover, self._origin))))
+        for instance_id, person in people.items():
+            added.append(self._scene.add(self._mesh(_person_triangles(person, instance_id, self._origin))))
         tags, colors, bits = (self._draw(output) for output in (TAGS, LIT_COLORS, DEPTH_BITS))
         for node in added:
             self._scene.remove_node(node)
@@ -237,33 +231,18 @@ def _trees(
     return crowns, UnitSolids(box, crown_bottom > -1.0, stems_m, (crown_middle - 1.0) / 2.0, bark)
 
 
-def _mover_triangles(mover: PosedBystander, origin: np.ndarray) -> Triangles:
-    """Return the triangles of the target or a bystander.
-
-    A person consists of balls, boxes and cylinders, a car of two boxes: the body, and a shorter, narrower cabin.
-    """
+def _person_triangles(person: PosedPerson, instance_id: int, origin: np.ndarray) -> Triangles:
+    """Return the triangles of a person: balls, boxes and cylinders."""
     import trimesh
 
-    body = mover.body
-    if isinstance(body, PosedPerson):
-        ball = trimesh.creation.icosphere(subdivisions=2)
-        box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
-        rod = trimesh.creation.cylinder(1.0, 2.0, sections=12).triangles
-        units = {"ball": ball.triangles, "rounded": box.triangles, "disc": rod, "limb": rod * LIMB_SHARE}
-        figure = figure_of(body)
-        solids = zip(figure.shapes, figure.centers_m, figure.turns, figure.half_m, strict=True)
-        parts = [(units[shape] * half) @ turn.T + center - origin for shape, center, turn, half in solids]
-        kind = KINDS["Pedestrians"]
-        corners_m = np.concatenate(parts)
-        colors = np.repeat(figure.colors, [len(part) for part in parts], axis=0)
-    else:
-        length, width, height = body.half_extents_m
-        lower = trimesh.creation.box(extents=(2 * length, 2 * width, height)).apply_translation((0, 0, -height / 2))
-        cabin = trimesh.creation.box(extents=(length, 2 * CABIN_WIDTH_SHARE * width, height))
-        cabin.apply_translation((CABIN_SHIFT_SHARE * length, 0, height / 2))
-        kind = KINDS["Car"]
-        corners_m = np.concatenate([lower.triangles, cabin.triangles])
-        corners_m = corners_m @ rotation_matrix(0.0, body.heading_rad, 0.0).T + body.center_m - origin
-        colors = np.tile(CAR_PAINTS[int(body.seed * len(CAR_PAINTS))], (len(corners_m), 1))
-    tag = _tags(np.array([kind]), np.array([mover.instance_id]), np.array([contract.STANDING_LAYER]))
-    return corners_m, colors, np.repeat(tag, len(corners_m), axis=0)
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
+    rod = trimesh.creation.cylinder(1.0, 2.0, sections=12).triangles
+    units = {"ball": ball.triangles, "rounded": box.triangles, "disc": rod, "limb": rod * LIMB_SHARE}
+    figure = figure_of(person)
+    solids = zip(figure.shapes, figure.centers_m, figure.turns, figure.half_m, strict=True)
+    parts = [(units[shape] * half) @ turn.T + center - origin for shape, center, turn, half in solids]
+    corners_m = np.concatenate(parts)
+    colors = np.repeat(figure.colors, [len(part) for part in parts], axis=0)
+    kinds, ids, layers = (np.array([tag]) for tag in (KINDS["Pedestrians"], instance_id, contract.STANDING_LAYER))
+    return corners_m, colors, np.repeat(_tags(kinds, ids, layers), len(corners_m), axis=0)

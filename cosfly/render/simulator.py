@@ -10,7 +10,7 @@ from pydantic import Field
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import Camera, Look
 from cosfly.geometry.axes import focal_px
-from cosfly.render.contract import PERSON_ID, Frame, Others, PosedCar, PosedPerson, check_pose
+from cosfly.render.contract import Frame, PosedPeople, PosedPerson, check_pose
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import EnvironmentMissing, RenderError
 from cosfly.runtime.worker import worker_index
@@ -21,7 +21,6 @@ log = logging.getLogger(__name__)
 TRIES = 3  # to draw a frame
 WALK_MPS = 1.4  # walking speed at full swing
 FIX = "read the server's log, then run the same command again; finished trajectories are kept"
-Body = PosedPerson | PosedCar
 
 
 class ServerCommand(Config):
@@ -65,15 +64,13 @@ class SimulatorRenderer(ABC):
         """Get ready to draw again after a frame failed."""
 
     @abstractmethod
-    def _frame(self, camera_pose: np.ndarray, fov_deg: float, bodies: dict[int, Body]) -> Frame:
-        """Draw one frame with these bodies, by instance id."""
+    def _frame(self, camera_pose: np.ndarray, fov_deg: float, people: PosedPeople) -> Frame:
+        """Draw one frame."""
 
     def _start_guard(self) -> EngineGuard:
         return EngineGuard(self.engine, self._cfg.host, self._port, self._cfg.server_command, self._cfg.timeout_s)
 
-    def render(
-        self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None, others: Others = ()
-    ) -> Frame:
+    def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, people: PosedPeople) -> Frame:
         """Draw one frame, as the contract says; one that fails is drawn again after `_recover`."""
         check_pose(camera_pose, intrinsic)
         width, height = self._size_px
@@ -85,14 +82,12 @@ class SimulatorRenderer(ABC):
             got = f"fx {fx:g}, fy {fy:g}, skew {skew:g}, principal point {cx:g}, {cy:g} px"
             expected = "square pixels, and the principal point in the middle of the picture"
             raise RenderError(what, where=self.device, got=got, expected=expected)
-        bodies: dict[int, Body] = {} if person is None else {PERSON_ID: person}
-        bodies |= {other.instance_id: other.body for other in others}
         problem: Exception | None = None
         for attempt in range(1, TRIES + 1):
             try:
                 if problem is not None:
                     self._recover(problem)
-                return self._frame(camera_pose, fov_deg, bodies)
+                return self._frame(camera_pose, fov_deg, people)
             except (NoPictureError, RuntimeError, EnvironmentMissing) as error:
                 if not isinstance(problem, EnvironmentMissing):  # the first one names the cause best
                     problem = error
@@ -104,16 +99,13 @@ class SimulatorRenderer(ABC):
         raise EnvironmentMissing("the simulator no longer answers", where=self.device, got=str(problem), fix=FIX)
 
 
-def placement_of(body: Body, lead_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return where to put a body so that it reaches its place `lead_s` seconds later.
+def placement_of(person: PosedPerson, lead_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return where to put a person who reaches the posed place `lead_s` seconds later.
 
     Returns:
-        Position, (3,) m, of a person's hip or a car's bottom; rotation, (3,) degrees; unit vector ahead, (3,); walking
-        speed, m/s, 0 for a car.
+        Position of the hip, (3,) m; rotation, (3,) degrees; unit vector ahead, (3,); walking speed, m/s.
     """
-    turn_deg = np.array([0.0, np.degrees(body.heading_rad), 0.0])
-    ahead = np.array([np.cos(body.heading_rad), np.sin(body.heading_rad), 0.0])
-    if isinstance(body, PosedCar):
-        return body.center_m - [0.0, 0.0, body.half_extents_m[2]], turn_deg, ahead, 0.0
-    speed_mps = WALK_MPS * body.swing
-    return body.hip_m - ahead * speed_mps * lead_s, turn_deg, ahead, speed_mps
+    turn_deg = np.array([0.0, np.degrees(person.heading_rad), 0.0])
+    ahead = np.array([np.cos(person.heading_rad), np.sin(person.heading_rad), 0.0])
+    speed_mps = WALK_MPS * person.swing
+    return person.hip_m - ahead * speed_mps * lead_s, turn_deg, ahead, speed_mps

@@ -172,14 +172,15 @@ def draw_frame(renderer: Renderer, script: TrackScript, i: int, poses: Poses, vi
     pose = world_from_camera(poses.positions_m[i], poses.rotations_deg[i])
     target_m = poses.targets_m[i]
     camera = script.cameras[i]
-    posed = script.bystanders.posed(i)
-    frame = renderer.render(pose, camera.intrinsic, script.gait.posed(i, target_m, script.clothes), posed)
+    target = script.gait.posed(i, target_m, script.clothes)
+    bystanders = script.bystanders.posed(i)
+    frame = renderer.render(pose, camera.intrinsic, {PERSON_ID: target, **bystanders})
     view = view_target(target_m, pose, camera)
-    ids = np.array([bystander.instance_id for bystander in posed], dtype=np.int64)
+    ids = np.array(list(bystanders), dtype=np.int64)
     score, by_bystanders, by_map = rendered_visibility(frame, target_m, view, pose, camera, ids)
     is_person = frame.ids == PERSON_ID
     num_px = int(np.count_nonzero(is_person))
-    target = TargetMeta(
+    target_meta = TargetMeta(
         world_location=target_m,
         half_extents_m=PERSON_HALF_EXTENTS_M,
         instance_id=PERSON_ID,
@@ -194,7 +195,8 @@ def draw_frame(renderer: Renderer, script: TrackScript, i: int, poses: Poses, vi
         visibility=score,
         num_pixels=num_px,
     )
-    return DrawnFrame(frame, target, script.bystanders.meta(i, frame, by_bystanders, by_map) if posed else None)
+    bystanders_meta = script.bystanders.meta(i, frame, by_bystanders, by_map) if bystanders else None
+    return DrawnFrame(frame, target_meta, bystanders_meta)
 
 
 def _list_or_none(values: np.ndarray) -> list[float] | None:

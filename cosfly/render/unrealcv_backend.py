@@ -17,8 +17,8 @@ from pydantic import Field
 from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.weather import WeatherParams
-from cosfly.render.contract import NEAR_M, NO_INSTANCE, Frame, PosedPerson, far_as_sky, instance_ids
-from cosfly.render.simulator import Body, NoPictureError, ServerCommand, SimulatorRenderer, placement_of
+from cosfly.render.contract import NEAR_M, NO_INSTANCE, Frame, PosedPeople, PosedPerson, far_as_sky, instance_ids
+from cosfly.render.simulator import NoPictureError, ServerCommand, SimulatorRenderer, placement_of
 from cosfly.runtime.arrays import parse_array
 from cosfly.runtime.errors import ConfigError, InputError, RenderError, shown
 from cosfly.runtime.png import colours_of
@@ -46,7 +46,6 @@ class UnrealCvRenderConfig(UnrealCvConfig, ServerCommand):
     settle_delay_s: float = Field(0.1, ge=0, description="time that the engine runs after a pose is set, s")
     animate: bool = Field(True, description="people walk while the engine settles; false: they are only placed")
     person_asset: ClassVar[str] = "/Game/TrafficSystem/Pedestrian/Base_User_Agent.Base_User_Agent_C"
-    car_asset: ClassVar[str] = "/Game/TrafficSystem/Vehicle/Vehicle1.Vehicle1_C"
 
 
 class UnrealCvRenderer(SimulatorRenderer):
@@ -169,7 +168,7 @@ class UnrealCvRenderer(SimulatorRenderer):
     # --- one frame ----------------------------------------------------------------------------------------------------
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
-        """Remove all people and cars; the weather of the level stays."""
+        """Remove all people; the weather of the level stays."""
         if weather is not None:
             fix = "set render.backend to `gl` or `carla`, or render.weather_mode to `off`"
             raise RenderError("the renderer `unrealcv` cannot draw weather", where=self.device, fix=fix)
@@ -177,12 +176,12 @@ class UnrealCvRenderer(SimulatorRenderer):
             for number in list(self._spawned):
                 self._server.run(self._removal(number))
 
-    def _frame(self, camera_pose: np.ndarray, fov_deg: float, bodies: dict[int, Body]) -> Frame:
+    def _frame(self, camera_pose: np.ndarray, fov_deg: float, people: PosedPeople) -> Frame:
         place, turn = self._in_level(camera_pose[:3, 3], camera_rotation_deg(camera_pose))
         try:
-            commands = ["vset /action/game/resume", *(self._removal(n) for n in self._spawned.keys() - bodies.keys())]
-            for number, body in bodies.items():
-                commands += self._placing(number, body)
+            commands = ["vset /action/game/resume", *(self._removal(n) for n in self._spawned.keys() - people.keys())]
+            for number, person in people.items():
+                commands += self._placing(number, person)
             if fov_deg != self._fov_deg:
                 commands.append(f"vset {CAMERA}/fov {fov_deg:.6f}")
             self._server.run(*commands, f"vset {CAMERA}/pose {place} {turn}")
@@ -247,31 +246,31 @@ class UnrealCvRenderer(SimulatorRenderer):
         ids[is_sky] = NO_INSTANCE
         return far_as_sky(Frame(pictures[0], depth_m, kinds, ids))
 
-    # --- people and cars ----------------------------------------------------------------------------------------------
+    # --- people -------------------------------------------------------------------------------------------------------
 
-    def _placing(self, number: int, body: Body) -> list[str]:
-        """Return the commands that place a body; a person who walks starts earlier on the way, by the settle delay."""
-        name = self._spawned.get(number) or self._spawn(number, body)
+    def _placing(self, number: int, person: PosedPerson) -> list[str]:
+        """Return the commands that place a person; one who walks starts earlier on the way, by the settle delay."""
+        name = self._spawned.get(number) or self._spawn(number)
         animate = self._cfg.animate
-        position_m, turn_deg, _, speed_mps = placement_of(body, self._cfg.settle_delay_s if animate else 0.0)
+        position_m, turn_deg, _, speed_mps = placement_of(person, self._cfg.settle_delay_s if animate else 0.0)
         place, turn = self._in_level(position_m, turn_deg)
         commands = [f"vset /object/{name}/location {place}", f"vset /object/{name}/rotation {turn}"]
-        if animate and isinstance(body, PosedPerson):
+        if animate:
             speed = f"vbp {name} SetMaxSpeed {speed_mps * self._cfg.coord_scale:.3f}"
             commands += [speed, f"vbp {name} MoveForward"] if speed_mps > 0.0 else [f"vbp {name} StopAgent"]
         return commands
 
-    def _spawn(self, number: int, body: Body) -> str:
-        """Spawn an object for a body, in a colour that no other object has; return its name."""
+    def _spawn(self, number: int) -> str:
+        """Spawn a person, in a colour that no other object has; return its name."""
         name = f"{OURS}{number}"
-        is_person = isinstance(body, PosedPerson)
-        asset = self._cfg.person_asset if is_person else self._cfg.car_asset
         color = next(c for c in range(COLORS - 1, 0, -1) if c not in self._used)
         paint = f"{color >> 16} {color >> 8 & 0xFF} {color & 0xFF}"
-        self._server.run(f"vset /objects/spawn_bp_asset {asset} {name}", f"vset /object/{name}/color {paint}")
+        self._server.run(
+            f"vset /objects/spawn_bp_asset {self._cfg.person_asset} {name}", f"vset /object/{name}/color {paint}"
+        )
         self._used.add(color)
         self._ids[color] = number
-        self._kinds[color] = KINDS["Pedestrians" if is_person else "Car"]
+        self._kinds[color] = KINDS["Pedestrians"]
         self._spawned[number] = name
         return name
 

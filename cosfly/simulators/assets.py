@@ -21,8 +21,7 @@ class Asset(NamedTuple):
 
 _TABLE = read_yaml(Path(__file__).with_name("assets.yaml"))
 ASSETS = tuple(Asset(**fields) for fields in _TABLE["assets"])
-PEOPLE = _TABLE["people"]
-NOT_TOWN = (*PEOPLE, *_TABLE["not_town"])
+NOT_TOWN = _TABLE["not_town"]
 
 
 def asset_of(name: str) -> Asset | None:
@@ -46,11 +45,6 @@ def kind_of(class_name: str) -> str | None:
 def is_no_part_of_town(class_name: str) -> bool:
     """Return whether a class has bounds but does not belong to a town."""
     return any(fnmatchcase(class_name, pattern) for pattern in NOT_TOWN)
-
-
-def is_person(path: str) -> bool:
-    """Return whether the path of an asset is that of a person."""
-    return any(fnmatchcase(path, pattern) for pattern in PEOPLE)
 
 
 def id_of(name: str) -> int:

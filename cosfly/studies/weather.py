@@ -11,6 +11,7 @@ from cosfly.formats.boxes import check_ground, read_boxes
 from cosfly.formats.traces import read_traces
 from cosfly.formats.weather import TIMES, WEATHERS, resolved
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
+from cosfly.render.contract import PERSON_ID
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import renderer_of
@@ -61,7 +62,7 @@ def run(cfg: RenderConfig, boxes: Path, traces: Path, out: Path, *, seed: int = 
     ):
         for weather, time_of_day in product(WEATHERS, TIMES):
             renderer.prepare(low_m, high_m, resolved(WEATHERS[weather], TIMES[time_of_day]))
-            rgb = renderer.render(pose, intrinsic, person).rgb
+            rgb = renderer.render(pose, intrinsic, {PERSON_ID: person}).rgb
             name = f"{weather}, {time_of_day}".replace("_", " ")
             pictures[weather, time_of_day] = name, cv2.resize(rgb, FIGURE_TILE_PX, interpolation=cv2.INTER_AREA)
             advance(1)

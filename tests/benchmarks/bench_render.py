@@ -25,6 +25,7 @@ from cosfly.geometry.kernels import obstacle_index
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_trajectory
 from cosfly.render import track as flight
+from cosfly.render.contract import PERSON_ID
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.stage import open_renderer
 from cosfly.render.track import MARGIN_M
@@ -54,7 +55,7 @@ def views(trace: DroneTrace, num_frames: int) -> list[tuple]:
     for number, i in enumerate(np.linspace(0, len(trace.time_s) - 1, num_frames).astype(int)):
         pose = world_from_camera(trace.positions_m[i], trace.rotations_deg[i])
         intrinsic = intrinsic_matrix(*SIZE, FOVS_DEG[number % len(FOVS_DEG)])
-        found.append((pose, intrinsic, gait.posed(int(i), trace.targets_m[i], clothes)))
+        found.append((pose, intrinsic, {PERSON_ID: gait.posed(int(i), trace.targets_m[i], clothes)}))
     return found
 
 
@@ -80,8 +81,8 @@ def parts(folder: Path, num_frames: int) -> tuple[str, list[Any]]:
     places = np.concatenate([trace.positions_m, trace.targets_m])
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M)
     todo = views(trace, num_frames)
-    for pose, intrinsic, person in todo[:: max(1, num_frames // 6)]:
-        renderer.render(pose, intrinsic, person)  # compiles what this flight needs
+    for view in todo[:: max(1, num_frames // 6)]:
+        renderer.render(*view)  # compiles what this flight needs
     measured = Parts()
     plain = renderer.render, renderer._read, renderer.context.finish
 

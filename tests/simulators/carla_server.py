@@ -11,7 +11,7 @@ import msgpack
 import numpy as np
 
 from cosfly.formats.boxes import BoxMap
-from cosfly.formats.bystanders import BUILDS
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.weather import WeatherParams
 from cosfly.simulators.conventions import DEPTH_RANGE_M, DEPTH_STEPS, SIMULATED_STEP_S, unreal_pose
 from simulators.scene import Mover, Server, listen, send
@@ -33,7 +33,7 @@ ATTRIBUTES = [  # name, type (2 int, 3 float, 4 str), value
     ("image_size_x", 2, "800"), ("image_size_y", 2, "600"), ("fov", 3, "90.0"), ("exposure_mode", 4, "histogram"),
     ("motion_blur_intensity", 3, "0.45"), ("motion_blur_max_distortion", 3, "0.35"),
 ]  # fmt: skip
-MODELS = [*CAMERAS, *(f"walker.pedestrian.{k:04d}" for k in range(1, 17)), "vehicle.tesla.model3"]
+MODELS = [*CAMERAS, *(f"walker.pedestrian.{k:04d}" for k in range(1, 17))]
 ROADS = "<OpenDRIVE><header><geoReference>+proj=tmerc +lat_0=0 +lon_0=0</geoReference></header></OpenDRIVE>"
 
 
@@ -107,13 +107,12 @@ class CarlaServer(Server):
 
     def _actor(self, number: int) -> list:
         actor = self.movers[number]
-        box = [[0.0] * 3, BUILDS.get(actor.kind, BUILDS["Car"]).half_extents_m, [0.0] * 3, number]
+        box = [[0.0] * 3, PERSON_HALF_EXTENTS_M, [0.0] * 3, number]
         return [number, 0, actor.description, box, b"", self._token(number) if actor.model in CAMERAS else b""]
 
     def _spawn(self, description: list, transform: list, *_: Any) -> list:
         number, pose = next(self._numbers), [*transform[0], *transform[1]]
-        kind = {"walker": "Pedestrians", "vehicle": "Car"}.get(description[1].split(".")[0], "Camera")
-        self.movers[number] = Mover(kind, description[1], pose, description)
+        self.movers[number] = Mover(description[1].startswith("walker."), description[1], pose, description)
         return self._actor(number)
 
     def _tick(self) -> int:

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from cosfly.formats.boxes import BoxMap
-from cosfly.formats.bystanders import BUILDS
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
-from cosfly.render.contract import PERSON_ID, Frame, PosedBystander, PosedCar, PosedPerson, instance_ids, other_id
+from cosfly.render.contract import PERSON_ID, Frame, PosedPerson, instance_ids, other_id
 from cosfly.render.person import SLOW_MPS, choose_clothes
 from cosfly.render.stage import open_renderer
 from cosfly.runtime.seeding import rng_for
@@ -27,11 +26,11 @@ FAULT = re.compile(r"(\w+)(?::(\w+))?@(\d+)(\+?)(?:=([\d.]+))?")  # NAME[:SENSOR
 
 @dataclass
 class Mover:
-    """A person, a vehicle or a camera. People walk straight on."""
+    """A person or a camera. People walk straight on."""
 
-    kind: str  # of BUILDS, but for cameras
+    is_person: bool
     model: str
-    pose: list[float]  # in Unreal's axes, m and degrees; of a person's middle, of a vehicle's bottom
+    pose: list[float]  # in Unreal's axes, m and degrees; of a person's middle
     description: list = field(default_factory=list)  # of the client that spawned it
     direction: tuple[float, ...] = (1.0, 0.0, 0.0)
     speed_mps: float = 0.0
@@ -40,13 +39,10 @@ class Mover:
         for axis, part in enumerate(self.direction):
             self.pose[axis] += part * self.speed_mps * step_s
 
-    def body(self) -> PosedPerson | PosedCar:
+    def body(self) -> PosedPerson:
         place_m, rotation_deg = world_pose(self.pose)
         heading_rad = float(np.radians(rotation_deg[1]))
-        if self.kind == "Pedestrians":
-            return PosedPerson(place_m, heading_rad, 0.0, min(self.speed_mps / SLOW_MPS, 1.0), clothes_of(self.model))
-        half_m = BUILDS[self.kind].half_extents_m
-        return PosedCar(place_m + np.array([0.0, 0.0, half_m[2]]), heading_rad, half_m, 0.5)
+        return PosedPerson(place_m, heading_rad, 0.0, min(self.speed_mps / SLOW_MPS, 1.0), clothes_of(self.model))
 
 
 def clothes_of(model: str) -> Any:
@@ -91,7 +87,7 @@ class Server:
         return [message] * (2 if self.due("duplicate", sensor) else 1)
 
     def bodies(self) -> dict[Any, Mover]:
-        return {key: mover for key, mover in self.movers.items() if mover.kind in BUILDS}
+        return {key: mover for key, mover in self.movers.items() if mover.is_person}
 
     def draw(self, size_px: tuple[int, int], fov_deg: float, pose: list[float]) -> tuple[Frame, np.ndarray]:
         """Draw what a camera sees, and the owner of each pixel: a row of the town, behind these a body, -1 for none."""
@@ -104,12 +100,12 @@ class Server:
         if self._prepared_for != self.weather:
             self._renderer.prepare(*self.town.bounds(), self.weather)
             self._prepared_for = self.weather
-        others = [PosedBystander(other_id(k), mover.body()) for k, mover in enumerate(self.bodies().values())]
-        ids = [*instance_ids(self.town, MOST_MOVERS), *(one.instance_id for one in others)]
+        others = {other_id(k): mover.body() for k, mover in enumerate(self.bodies().values())}
+        ids = [*instance_ids(self.town, MOST_MOVERS), *others]
         owners = np.full(PERSON_ID + 1, -1)
         owners[ids] = np.arange(len(ids))
         camera = world_from_camera(*world_pose(pose)), intrinsic_matrix(*size_px, fov_deg)
-        frame = self._renderer.render(*camera, None, others)
+        frame = self._renderer.render(*camera, others)
         self._drawn = key, (frame, owners[frame.ids])
         return self._drawn[1]
 

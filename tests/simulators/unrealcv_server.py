@@ -13,7 +13,6 @@ import numpy as np
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KIND_NAMES, KINDS
-from cosfly.simulators.assets import is_person
 from cosfly.simulators.conventions import CM_PER_M, FAR_CM, unreal_pose
 from simulators.scene import Mover, Server, listen, send
 
@@ -78,7 +77,7 @@ class UnrealCvServer(Server):
         return b"error Can not find a handler for URI"
 
     def _spawn(self, path: str, name: str) -> None:
-        self.movers[name] = Mover("Pedestrians" if is_person(path) else "Car", path.rpartition(".")[2], [0.0] * 6)
+        self.movers[name] = Mover(True, path.rpartition(".")[2], [0.0] * 6)
 
     def _move(self, name: str, what: str, *numbers: str) -> None:
         first, scale = (0, CM_PER_M) if what == "location" else (3, 1.0)

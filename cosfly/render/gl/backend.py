@@ -16,7 +16,7 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import SKY_DEPTH_M, Look
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.weather import WeatherParams
-from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Frame, Others, PosedPerson, check_pose, far_as_sky
+from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Frame, PosedPeople, PosedPerson, check_pose, far_as_sky
 from cosfly.render.gl import meshes, movers, programs
 from cosfly.render.gl.parts import DRAW_ORDER, NEVER_PX, NUM_MATERIALS, PART, CameraView, materials_of
 from cosfly.render.gl.programs import LooseBuffers, Programs, set_uniform
@@ -36,7 +36,7 @@ MAX_BONES = 6
 EDGE_LEVELS = 5  # larger steps of brightness are smoothed
 EDGE_BLUR_PX = 0.62
 MESH_STRIDE = 64  # more than there are meshes
-MOVER_M = 4.5  # largest distance between two parts of one person or car
+MOVER_M = 4.5  # largest distance between two parts of one person
 SOFTWARE = "llvmpipe"  # draws on the processor, and interpolates where hardware snaps to a grid (scene.frag.glsl)
 # Triangles that llvmpipe may hold back. It allocates another list of them (36 MB) whenever one is full while the last
 # is still being drawn, and never frees one: without this limit a process grows by a seventh over thousands of frames.
@@ -115,7 +115,7 @@ class GlRenderer:
             compiled = programs.programs_of(self.context, define, snaps=not self._is_software)
             weather = None
             if define is not None:
-                weather = WeatherPass(self.context, self._color, self._depth, compiled.rain, self.num_others)
+                weather = WeatherPass(self.context, self._color, self._depth, compiled.rain)
             self._looks[define] = compiled, self.context.vertex_array(compiled.sky, []), weather
         self._programs, self._sky, self._weather = self._looks[define]
 
@@ -232,11 +232,11 @@ class GlRenderer:
 
     # --- one frame ---
 
-    def render(
-        self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None, others: Others = ()
-    ) -> Frame:
+    def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, people: PosedPeople) -> Frame:
         """Draw one frame, as the contract says."""
         check_pose(camera_pose, intrinsic)
+        person = people.get(PERSON_ID)
+        others = {number: other for number, other in people.items() if number != PERSON_ID}
         figure = None if person is None else figure_of(person)
         eye = camera_pose[:3, 3] - self.origin_m
         view = CameraView(camera_pose[:3, :3], eye, intrinsic, self.width_px, self.height_px)
@@ -244,8 +244,7 @@ class GlRenderer:
         moving += movers.bystander_parts(others, self.origin_m, view)
         bones = np.zeros((0, 2, 4), np.float32) if figure is None else _bones_of(figure, self.origin_m)
         capsules = movers.capsules_of(others, self.origin_m, view)
-        has_headlights = self._weather is not None and self._weather.has_lights
-        regions = movers.shadow_regions(bones, capsules, self._sun, view, has_headlights)
+        regions = movers.shadow_regions(bones, capsules, self._sun, view)
         uniforms = self._uniforms(view, camera_pose, person)
         with self.context:
             self._set_uniforms(self._programs.materials, uniforms)

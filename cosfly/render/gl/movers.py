@@ -1,4 +1,4 @@
-"""People and cars as drawable parts of one frame, and the rectangles of pixels that their shadows may change."""
+"""People as drawable parts of one frame, and the rectangles of pixels that their shadows may change."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
-from cosfly.geometry.axes import box_corners, rotation_matrix
-from cosfly.render.contract import LAYER_STEP, STANDING_LAYER, Others, PosedBystander, PosedCar, PosedPerson
+from cosfly.geometry.axes import box_corners
+from cosfly.render.contract import LAYER_STEP, STANDING_LAYER, PosedPeople, PosedPerson
 from cosfly.render.gl import meshes
-from cosfly.render.gl.parts import CLOTH, PART, Boxes, CameraView, Parts, tags
-from cosfly.render.gl.shapes import parts_of
+from cosfly.render.gl.parts import CLOTH, PART, CameraView, tags
 from cosfly.render.person import PersonFigure, figure_of
 
 SHAPES = {"ball": meshes.SPHERE, "rounded": meshes.ROUNDED, "limb": meshes.LIMB, "disc": meshes.CYLINDER}
@@ -25,7 +24,7 @@ PERSON_CAPSULE_M = (0.15, 1.62, 0.19)  # lower and upper end above the feet, rad
 
 
 class Mover(NamedTuple):
-    """A person or a car as k parts, relative to the origin."""
+    """A person as k parts, relative to the origin."""
 
     records: np.ndarray  # (k,) PART
     mesh_numbers: np.ndarray  # (k,)
@@ -43,31 +42,16 @@ def figure_parts(figure: PersonFigure, instance_id: int, origin_m: np.ndarray) -
     return Mover(records, np.array([SHAPES[shape] for shape in figure.shapes]))
 
 
-def bystander_parts(others: Others, origin_m: np.ndarray, view: CameraView) -> list[Mover]:
+def bystander_parts(others: PosedPeople, origin_m: np.ndarray, view: CameraView) -> list[Mover]:
     """Return the parts of the bystanders that the camera may see."""
-    parts = []
-    for other in others:
-        center = other.center_m - origin_m
-        if isinstance(other.body, PosedPerson):
-            if view.can_show(center, PERSON_RADIUS_M):
-                parts.append(figure_parts(figure_of(other.body), other.instance_id, origin_m))
-        elif view.can_show(center, float(np.linalg.norm(other.body.half_extents_m))):
-            parts.append(_car_parts(other.body, other.instance_id, center, view))
-    return parts
+    return [
+        figure_parts(figure_of(person), instance_id, origin_m)
+        for instance_id, person in others.items()
+        if view.can_show(person.hip_m - origin_m, PERSON_RADIUS_M)
+    ]
 
 
-def _car_parts(car: PosedCar, instance_id: int, center: np.ndarray, view: CameraView) -> Mover:
-    """Return the parts of a car, in the shape of a map's parked cars."""
-    turn = rotation_matrix(0.0, car.heading_rad, 0.0)
-    half = np.array(car.half_extents_m)
-    ids = np.array([instance_id], np.uint16)
-    boxes = Boxes(center[None], half[None], turn[None], ids, np.array([car.seed]), KINDS["Car"], np.zeros(1))
-    parts = Parts.concatenate(parts_of(boxes))
-    rows = view.part_rows_in_view(parts)
-    return Mover(parts.records[rows], parts.mesh[rows])
-
-
-def capsules_of(others: Others, origin_m: np.ndarray, view: CameraView) -> np.ndarray:
+def capsules_of(others: PosedPeople, origin_m: np.ndarray, view: CameraView) -> np.ndarray:
     """Return capsules of the bystanders that may cast a visible shadow.
 
     The shader tests each pixel of a shadow region against each of its capsules, the largest cost of bystanders.
@@ -76,25 +60,18 @@ def capsules_of(others: Others, origin_m: np.ndarray, view: CameraView) -> np.nd
         (k, 2, 4) float32, metres, relative to the origin: [start, radius] and [end, instance id].
     """
 
-    def distance_m(other: PosedBystander) -> float:
-        return float(np.linalg.norm(other.center_m - origin_m - view.eye))
+    def distance_m(other: tuple[int, PosedPerson]) -> float:
+        return float(np.linalg.norm(other[1].hip_m - origin_m - view.eye))
 
-    visible = [other for other in others if view.can_show(other.center_m - origin_m, SHADOW_M)]
+    visible = [other for other in others.items() if view.can_show(other[1].hip_m - origin_m, SHADOW_M)]
     nearest = sorted(visible, key=distance_m)[:MOST_CAPSULES]
     capsules = np.zeros((len(nearest), 2, 4), np.float32)
-    for capsule, other in zip(capsules, nearest, strict=True):
-        center = other.center_m - origin_m
-        if isinstance(other.body, PosedPerson):
-            low, high, radius = PERSON_CAPSULE_M
-            ends = center + np.array([[0.0, 0.0, low], [0.0, 0.0, high]]) - [0.0, 0.0, TARGET_HEIGHT_M]
-        else:
-            length, width, height = other.body.half_extents_m
-            ahead = (length - width) * np.array([np.cos(other.body.heading_rad), np.sin(other.body.heading_rad), 0.0])
-            radius = max(width, height)
-            ends = center + np.array([-ahead, ahead])
-        capsule[:, :3] = ends
+    low, high, radius = PERSON_CAPSULE_M
+    for capsule, (instance_id, person) in zip(capsules, nearest, strict=True):
+        feet = person.hip_m - origin_m - [0.0, 0.0, TARGET_HEIGHT_M]
+        capsule[:, :3] = feet + np.array([[0.0, 0.0, low], [0.0, 0.0, high]])
         capsule[0, 3] = radius
-        capsule[1, 3] = other.instance_id
+        capsule[1, 3] = instance_id
     return capsules
 
 
@@ -104,10 +81,6 @@ def capsules_of(others: Others, origin_m: np.ndarray, view: CameraView) -> np.nd
 # though the shadows cover a hundredth of its pixels. So the scene is drawn without these shadows, and then the shadow
 # regions are drawn again with them.
 PERSON_REACH_M = 30.0**0.5  # reach of the person's shadow in the shader, from the hip
-SHORTEST_CAR_M = 0.5  # as in the shader: a capsule with a shorter axis has no headlights
-HEADLIGHT_M = 26.0  # reach of headlights, as in the shader
-HEADLIGHT_ASIDE_M = 9.0  # half the width of their light, as in the shader
-HEADLIGHT_UP_M = 3.0  # half the height of their light
 EDGE = 1.25  # a shadow ends this many radii from a capsule's axis
 SKY_RADII = 4.5  # a capsule blocks light of the sky this many radii to each side
 PERSON_SKY_M = 1.0  # the person blocks light of the sky this far to each side
@@ -116,10 +89,10 @@ LONGEST_M = 60.0  # length of the longest shadow
 
 
 class ShadowRegion(NamedTuple):
-    """One rectangle of pixels and the movers whose shadows or headlights may change it."""
+    """One rectangle of pixels and the movers whose shadows may change it."""
 
     rectangle_px: tuple[int, int, int, int]  # x0, y0, x1, y1
-    points: np.ndarray  # (k, 3) m, relative to the scene's origin; their hull holds the shadows and lights
+    points: np.ndarray  # (k, 3) m, relative to the scene's origin; their hull holds the shadows
     capsules: np.ndarray  # (c, 2, 4) of `capsules_of`
     has_person: bool  # whether the target is one of the movers
 
@@ -138,22 +111,17 @@ class ShadowRegion(NamedTuple):
         )
 
 
-def shadow_regions(
-    bones: np.ndarray, capsules: np.ndarray, sun: np.ndarray, view: CameraView, has_headlights: bool = False
-) -> list[ShadowRegion]:
+def shadow_regions(bones: np.ndarray, capsules: np.ndarray, sun: np.ndarray, view: CameraView) -> list[ShadowRegion]:
     """Return the shadow regions of a frame, merged where they overlap.
 
     Args:
         bones: (b, 2, 4) capsules of the person, [start, radius] and [end, 0]; b is 0 without a person.
         capsules: (c, 2, 4) of bystanders.
         sun: (3,) unit vector towards the sun.
-        has_headlights: Whether cars light the ground in front of them.
     """
     movers = []  # points, capsules, whether it is the person
     for capsule in capsules[:, None]:
         points = _shadow_points(capsule, sun, SKY_RADII * float(capsule[0, 0, 3]), LONGEST_M)
-        if has_headlights:
-            points = np.concatenate([points, _headlight_points(capsule)])
         movers.append((points, capsule, False))
     if len(bones):
         movers.append((_shadow_points(bones, sun, PERSON_SKY_M, PERSON_REACH_M), capsules[:0], True))
@@ -192,21 +160,6 @@ def _shadow_points(capsules: np.ndarray, sun: np.ndarray, aside_m: float, longes
     sky_low = low - np.array([aside_m, aside_m, BELOW_M])
     sky_high = high + np.array([aside_m, aside_m, 0.0])
     return np.concatenate([body, body - length_m * sun, _corners(sky_low, sky_high)])
-
-
-def _headlight_points(capsule: np.ndarray) -> np.ndarray:
-    """Return corners around the light of a car's headlights, (8, 3), or (0, 3) below SHORTEST_CAR_M.
-
-    Args:
-        capsule: (1, 2, 4), from the back of the car to its front.
-    """
-    back, front = capsule[0, :, :3]
-    along = front - back
-    if np.linalg.norm(along) < SHORTEST_CAR_M:
-        return np.zeros((0, 3))
-    end = front + along / np.linalg.norm(along) * HEADLIGHT_M
-    margin = np.array([HEADLIGHT_ASIDE_M, HEADLIGHT_ASIDE_M, HEADLIGHT_UP_M])
-    return _corners(np.minimum(front, end) - margin, np.maximum(front, end) + margin)
 
 
 def _corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:

@@ -277,8 +277,7 @@ float person_lets_sun(vec3 p) {
     return light;
 }
 
-// What the others leave of the sun and of the sky, for everybody but themselves; by night their headlights.
-vec3 from_headlights = vec3(0.0);
+// What the others leave of the sun and of the sky, for everybody but themselves.
 vec2 others_let(vec3 p) {
     vec2 light = vec2(1.0);
     float own = float(f_tag >> 16);
@@ -286,9 +285,6 @@ vec2 others_let(vec3 p) {
         vec4 a = other_bones[2 * i], b = other_bones[2 * i + 1];
         if (b.w == own) continue;
         light.x = min(light.x, capsule_lets_sun(p, a.xyz, b.xyz, a.w));
-#ifdef LIT
-        from_headlights += headlights(p, a.xyz, b.xyz, a.w);
-#endif
         vec2 u = b.xy - a.xy, w = p.xy - a.xy;
         vec2 d = w - clamp(dot(u, w) / max(dot(u, u), 1e-6), 0.0, 1.0) * u;
         light.y = min(light.y, 1.0 - 0.45 * exp(-0.36 * dot(d, d) / (a.w * a.w)) * step(p.z, max(a.z, b.z)));
@@ -404,10 +400,6 @@ void main() {
 #endif
 #ifdef LIT
     if (material == LAMP && f_color.r > 0.5) s.glow += lights_on * vec3(2.6, 2.1, 1.35) * (v_normal.z < 0.35 ? 1.0 : 0.35);
-    if (material == CAR_PAINT && (f_tag >> 16) >= lowest_other && (f_tag >> 16) <= highest_other) {
-        vec3 r = v_local / f_half;
-        if (abs(r.x) > 0.93 && abs(r.y) > 0.5 && r.z > -0.1 && r.z < 0.55) s.glow += lights_on * (r.x > 0.0 ? vec3(2.2, 2.05, 1.8) : vec3(1.2, 0.05, 0.03));
-    }
 #endif
     // Light: a warm sun, a blue sky, some light from the ground; darker near the ground between tall things.
     float facing = dot(s.normal, sun_direction);
@@ -431,7 +423,7 @@ void main() {
     vec3 light = sun_light * sun * mix(1.0, s.shade, 0.5) + ambient;
     vec3 lamp = vec3(0.0);
 #ifdef LIT
-    lamp = lamp_reach(v_world, geometric) + from_headlights * (0.5 + 0.5 * abs(geometric.z));
+    lamp = lamp_reach(v_world, geometric);
     light += lamp * mix(1.0, s.shade, 0.7);
 #endif
     vec3 color = s.albedo * light + s.glow;

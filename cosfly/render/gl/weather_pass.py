@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from cosfly.formats.weather import SUN_IS_DOWN_DEG, WeatherParams
-from cosfly.render.contract import MAX_BOX_ID, PosedPerson
+from cosfly.render.contract import PosedPerson
 from cosfly.render.gl.parts import Parts
 from cosfly.render.gl.programs import set_uniform
 from cosfly.render.weather import fog_extinction
@@ -216,11 +216,10 @@ def defines(params: WeatherParams) -> str:
 class WeatherPass:
     """The weather of a trajectory on one GL context."""
 
-    def __init__(self, context: Any, color: Any, depth: Any, rain_program: Any, num_others: int) -> None:
+    def __init__(self, context: Any, color: Any, depth: Any, rain_program: Any) -> None:
         self._context = context
         self._depth = depth
         self._rain_program = rain_program
-        self._num_others = num_others
         self._rain = context.vertex_array(rain_program, [])
         self._over_color = context.framebuffer([color])
         self._lamp_map = context.texture((MAP_PX, MAP_PX), 2, dtype="f4")
@@ -246,8 +245,6 @@ class WeatherPass:
             "sun_direction": self.sun_direction,
             "lamp_area": area,
             "lamp_map": LAMP_UNIT,
-            "lowest_other": MAX_BOX_ID - self._num_others + 1,
-            "highest_other": MAX_BOX_ID,
             "wind": np.array(WIND),
             "depth_map": DEPTH_UNIT,
         }

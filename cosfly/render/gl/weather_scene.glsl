@@ -5,8 +5,6 @@ uniform vec4 lamps[16];           // those nearest to the camera: place, strengt
 uniform int num_lamps;
 uniform float penumbra_m;         // width of a shadow's border
 uniform float shadow_texel_m;
-uniform uint lowest_other;        // instance ids from here to highest_other are of those who move
-uniform uint highest_other;
 
 // The shadow map round a place: clouds spread the sun, and its shadows have wide borders.
 float soft_shadow(sampler2DShadow map, mat4 map_from_world, vec3 p, vec3 n) {
@@ -28,17 +26,6 @@ vec3 lamp_reach(vec3 p, vec3 n) {
     vec2 found = texture(lamp_map, (p.xy + 0.8 * n.xy - lamp_area.xy) * lamp_area.zw).rg;
     float over = max(p.z - found.y + 0.5, 0.0);
     return lamp_light * found.x * (0.6 + 0.4 * n.z) * exp(-0.7 * over);
-}
-
-// Headlights of cars that move, on what lies before them. a, b: the car's axis, back to front.
-vec3 headlights(vec3 p, vec3 a, vec3 b, float radius) {
-    vec2 along = b.xy - a.xy;
-    float size = length(along);
-    if (size < 0.5 || lights_on <= 0.0) return vec3(0.0);
-    vec2 d = p.xy - b.xy, axis = along / size;
-    float ahead = dot(d, axis) - 0.3 * radius, aside = abs(d.x * axis.y - d.y * axis.x);
-    float cone = smoothstep(0.0, 2.0, ahead) * smoothstep(26.0, 16.0, ahead) * exp(-0.09 * ahead) * exp(-pow(aside / (0.9 + 0.12 * max(ahead, 0.0)), 2.0));
-    return lights_on * vec3(1.0, 0.93, 0.8) * 0.9 * cone * exp(-0.8 * max(p.z - b.z, 0.0));
 }
 
 // Light from behind a pane; id in [0, 1) is the window's.
