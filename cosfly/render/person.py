@@ -185,15 +185,13 @@ HEMS = {"jacket": (0.82, 1.12, 0.15, 0.19), "coat": (0.46, 1.14, 0.22, 0.235), "
 
 @dataclass(frozen=True)
 class PersonFigure:
-    """A posed figure: k solids that are drawn, and b bones (capsules) that cast the shadow. Axes: world."""
+    """A posed figure of k solids. Axes: world."""
 
     shapes: tuple[str, ...]  # k of: ball, rounded (a box), limb (thicker at its upper end), disc
     centers_m: np.ndarray  # (k, 3)
     turns: np.ndarray  # (k, 3, 3) world_from_solid
     half_m: np.ndarray  # (k, 3) half sizes in the solid's own axes
     colors: np.ndarray  # (k, 3) linear RGB
-    bones_m: np.ndarray  # (b, 2, 3) ends
-    bone_radii_m: np.ndarray  # (b,)
 
 
 @dataclass
@@ -202,7 +200,6 @@ class _Body:
 
     solids: list[tuple] = field(default_factory=list)  # (shape, center, half, color, pitch, roll)
     limbs: list[tuple] = field(default_factory=list)  # (low, high, radius, color)
-    bones: list[tuple] = field(default_factory=list)  # (low, high, radius)
 
     def solid(
         self, shape: str, center: list[float], half: list[float], color: np.ndarray, pitch_rad: float = 0.0,
@@ -224,7 +221,6 @@ class _Body:
         x = np.stack([z[:, 2], 0.0 * lengths, -z[:, 0]], axis=1) / np.hypot(z[:, 0], z[:, 2])[:, None]
         limb_turns = np.stack([x, np.cross(z, x), z], axis=2)
         limb_half = np.stack([limb_radii, limb_radii, lengths / 2.0 + LIMB_OVERLAP * limb_radii], axis=1)
-        bone_lows, bone_highs, bone_radii = (np.array(column) for column in zip(*self.bones, strict=True))
         turn = rotation_matrix(0.0, heading_rad, 0.0)
         return PersonFigure(
             shapes=(*shapes, *["limb"] * len(lengths)),
@@ -232,8 +228,6 @@ class _Body:
             turns=turn @ np.concatenate([turns, limb_turns]),
             half_m=size * np.concatenate([half, limb_half]),
             colors=np.concatenate([colors, limb_colors]),
-            bones_m=feet_m + size * np.stack([bone_lows, bone_highs], axis=1) @ turn.T,
-            bone_radii_m=size * bone_radii,
         )
 
 
@@ -274,8 +268,6 @@ def _leg(body: _Body, side: float, phase: float, swing: float, clothes: Clothes)
     toe = 0.5 * (angle - bend)
     center = ankle + np.array([0.048 * np.cos(toe), 0.0, -0.043 + 0.048 * np.sin(toe)])
     body.solid("rounded", center.tolist(), [0.115, 0.048, 0.042], clothes.shoes, pitch_rad=-toe)
-    is_wide = clothes.looks.top == "coat" or legs == "skirt"
-    body.bones.append((ankle - [0, 0, 0.05], hip, 0.12 if is_wide else 0.085))
     return ankle
 
 
@@ -288,7 +280,6 @@ def _arm(body: _Body, side: float, phase: float, swing: float, clothes: Clothes)
     body.limb(elbow, shoulder, 0.058, clothes.color("top"))
     body.limb(wrist, elbow, 0.041 if is_bare else 0.055, clothes.skin if is_bare else clothes.color("top"))
     body.solid("ball", (wrist + np.array([0.01, 0, -0.05])).tolist(), [0.04, 0.03, 0.065], clothes.skin)
-    body.bones.append((wrist, shoulder, 0.05))
 
 
 def _trunk(body: _Body, breadth: float, swing: float, clothes: Clothes) -> None:
@@ -304,7 +295,6 @@ def _trunk(body: _Body, breadth: float, swing: float, clothes: Clothes) -> None:
             center = [0.0, 0.0, (low + high) / 2.0]
             half = [ahead, aside, (high - low) / 2.0]
             body.solid("limb", center, half, clothes.color(slot), pitch_rad=np.pi)
-    body.bones.append((np.array([0.0, 0.0, 0.95]), np.array([0.01, 0.0, 1.36]), 0.17))
 
 
 def _head(body: _Body, clothes: Clothes) -> None:
@@ -324,7 +314,6 @@ def _head(body: _Body, clothes: Clothes) -> None:
             body.solid("rounded", [0.14, 0.0, 1.70], [0.085, 0.075, 0.012], color, pitch_rad=0.15)
         else:
             body.solid("disc", [0.01, 0.0, 1.69], [0.235, 0.225, 0.012], color)
-    body.bones.append((np.array([0.02, 0.0, 1.60]), np.array([0.02, 0.0, 1.70]), 0.14 if hat == "brim" else 0.095))
 
 
 def _bag(body: _Body, breadth: float, clothes: Clothes) -> None:

@@ -17,12 +17,12 @@ from cosfly.formats.frames import SKY_DEPTH_M, Look
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.weather import WeatherParams
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Frame, PosedPeople, PosedPerson, check_pose, far_as_sky
-from cosfly.render.gl import meshes, movers, programs
+from cosfly.render.gl import meshes, programs
 from cosfly.render.gl.parts import DRAW_ORDER, NEVER_PX, NUM_MATERIALS, PART, CameraView, materials_of
+from cosfly.render.gl.people import CAPSULE_M, PERSON_RADIUS_M, PersonParts, feet_of, person_parts, shadow_corners
 from cosfly.render.gl.programs import LooseBuffers, Programs, set_uniform
 from cosfly.render.gl.scene import build_scene
-from cosfly.render.gl.weather_pass import WeatherPass, defines
-from cosfly.render.person import PersonFigure, figure_of
+from cosfly.render.gl.weather_pass import DEPTH_UNIT, WeatherPass, defines
 from cosfly.runtime.worker import return_freed_memory
 
 SHADOW_SIZE_PX = 2560  # side of the sun's shadow map
@@ -32,11 +32,10 @@ TALLEST_AMBIENT_M = 14.0  # a tower hides no more sky from the street than a hou
 SMALLEST_SHADOW_AREA_M, LARGEST_SHADOW_AREA_M = 40.0, 420.0  # side
 SHADOW_MARGIN = 1.1  # the shadow map is this many times as wide, so that its edge is outside the area
 ABOVE_CASTERS_M, BELOW_GROUND_M = 1.0, 10.0  # depth range of the height map
-MAX_BONES = 6
 EDGE_LEVELS = 5  # larger steps of brightness are smoothed
 EDGE_BLUR_PX = 0.62
+TAG_UNIT = 4  # texture unit, after those of the weather
 MESH_STRIDE = 64  # more than there are meshes
-MOVER_M = 4.5  # largest distance between two parts of one person
 SOFTWARE = "llvmpipe"  # draws on the processor, and interpolates where hardware snaps to a grid (scene.frag.glsl)
 # Triangles that llvmpipe may hold back. It allocates another list of them (36 MB) whenever one is full while the last
 # is still being drawn, and never frees one: without this limit a process grows by a seventh over thousands of frames.
@@ -68,6 +67,7 @@ class GlRenderer:
             self._depth = context.texture(size, 1, dtype="f4")
             self._tags = context.texture(size, 1, dtype="u4")
             self._image = context.framebuffer([self._color, self._depth, self._tags], context.depth_renderbuffer(size))
+            self._over_color = context.framebuffer([self._color])
             all_meshes = meshes.all_meshes()
             self._meshes = [
                 (context.buffer(mesh.vertices.tobytes()), context.buffer(mesh.triangles.tobytes()))
@@ -78,7 +78,7 @@ class GlRenderer:
             self._arrays: dict[tuple[int, int], tuple[Any, Any]] = {}  # made when needed
             texts = programs.sources(("part.glsl", "depth.vert.glsl"), ("depth.frag.glsl",))
             self._depth_program = context.program(*texts)
-            self._looks: dict[str | None, tuple[Programs, Any, WeatherPass | None]] = {}
+            self._looks: dict[str | None, tuple[Programs, Any, Any, WeatherPass | None]] = {}
             self._use_weather(None)
         self._open_map(box_map)
         self.prepare(*self.scene.bounds())
@@ -115,9 +115,10 @@ class GlRenderer:
             compiled = programs.programs_of(self.context, define, snaps=not self._is_software)
             weather = None
             if define is not None:
-                weather = WeatherPass(self.context, self._color, self._depth, compiled.rain)
-            self._looks[define] = compiled, self.context.vertex_array(compiled.sky, []), weather
-        self._programs, self._sky, self._weather = self._looks[define]
+                weather = WeatherPass(self.context, self._over_color, self._depth, compiled.rain)
+            triangles = (self.context.vertex_array(program, []) for program in (compiled.sky, compiled.shadow))
+            self._looks[define] = compiled, *triangles, weather
+        self._programs, self._sky, self._shadow_triangle, self._weather = self._looks[define]
 
     def _array(self, program: Any, mesh: int) -> tuple[Any, Any]:
         """Return vertex array and instance buffer of a program for a mesh."""
@@ -235,19 +236,16 @@ class GlRenderer:
     def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, people: PosedPeople) -> Frame:
         """Draw one frame, as the contract says."""
         check_pose(camera_pose, intrinsic)
-        person = people.get(PERSON_ID)
-        others = {number: other for number, other in people.items() if number != PERSON_ID}
-        figure = None if person is None else figure_of(person)
         eye = camera_pose[:3, 3] - self.origin_m
         view = CameraView(camera_pose[:3, :3], eye, intrinsic, self.width_px, self.height_px)
-        moving = [] if figure is None else [movers.figure_parts(figure, PERSON_ID, self.origin_m)]
-        moving += movers.bystander_parts(others, self.origin_m, view)
-        bones = np.zeros((0, 2, 4), np.float32) if figure is None else _bones_of(figure, self.origin_m)
-        capsules = movers.capsules_of(others, self.origin_m, view)
-        regions = movers.shadow_regions(bones, capsules, self._sun, view)
-        uniforms = self._uniforms(view, camera_pose, person)
+        persons = [
+            person_parts(person, instance_id, self.origin_m)
+            for instance_id, person in people.items()
+            if view.can_show(person.hip_m - self.origin_m, PERSON_RADIUS_M)
+        ]
+        uniforms = self._uniforms(view, camera_pose, people.get(PERSON_ID))
         with self.context:
-            self._set_uniforms(self._programs.materials, uniforms)
+            self._set_uniforms(uniforms)
             rows = view.part_rows_in_view(self._parts)
             self._loose.see(view)
             self._image.use()
@@ -259,15 +257,11 @@ class GlRenderer:
             self._height.use(1)
             if self._weather is not None:
                 self._weather.use()
-            self._draw_scene(self._programs.materials, rows, moving)
-            if regions:
-                center = np.zeros(3) if person is None else person.hip_m - self.origin_m
-                self._set_uniforms(self._programs.near_movers, uniforms | {"person_center": center})
-            for region in regions:
-                self._draw_region(region, bones, rows, moving)
+            self._draw_scene(rows, persons)
             # Clearing targets of mixed types leaves garbage: the sky's triangle writes all three where nothing is.
             self.context.disable(self.context.CULL_FACE)
             self._sky.render(vertices=3)
+            self._draw_shadows(view, people)
             if self._weather is not None:
                 self._weather.draw_rain(uniforms)
             return self._read()
@@ -291,52 +285,52 @@ class GlRenderer:
             "height_map": 1,
             "sky_depth_m": SKY_DEPTH_M,
             "sky_tag": KINDS["Sky"],
+            "person_kind": KINDS["Pedestrians"],
+            "depth_map": DEPTH_UNIT,
+            "tag_map": TAG_UNIT,
+            "capsule": CAPSULE_M,
             **self._area,
             **of_weather,
         }
 
-    def _set_uniforms(self, materials: list[Any], values: dict[str, Any]) -> None:
-        """Set the uniforms of the sky and of one program for each material."""
+    def _set_uniforms(self, values: dict[str, Any]) -> None:
+        """Set the uniforms of all programs that draw the scene."""
+        compiled = self._programs
         for name, value in values.items():
             packed = programs.packed(value)
-            for program in (*materials, self._programs.sky):
+            for program in (*compiled.materials, compiled.sky, compiled.shadow):
                 set_uniform(program, name, packed)
 
-    def _draw_region(
-        self, region: movers.ShadowRegion, bones: np.ndarray, rows: np.ndarray, moving: list[movers.Mover]
-    ) -> None:
-        """Draw the rectangle of a shadow region again, with the shadows of its movers."""
-        for name, count, most, capsules in (
-            ("person_bones", "person_num_bones", MAX_BONES, bones if region.has_person else bones[:0]),
-            ("other_bones", "num_others", movers.MOST_CAPSULES, region.capsules),
-        ):
-            padded = np.zeros((most, 2, 4), np.float32)
-            padded[: len(capsules)] = capsules
-            for program in self._programs.near_movers:
-                set_uniform(program, name, padded.tobytes())
-                set_uniform(program, count, len(capsules))
-        # A sphere around the points. Objects outside it do not change.
-        center = (region.points.min(axis=0) + region.points.max(axis=0)) / 2.0
-        radius = float(np.linalg.norm(region.points - center, axis=1).max())
-        away = np.linalg.norm(self._parts.object_centers[rows] - center, axis=1) - self._parts.object_radii[rows]
-        near = [mover for mover in moving if np.linalg.norm(mover.records["center"][0] - center) < radius + MOVER_M]
-        x0, y0, x1, y1 = region.rectangle_px
-        self._image.scissor = x0, y0, x1 - x0, y1 - y0
-        self._draw_scene(self._programs.near_movers, rows[away < radius], near)
-        self._image.scissor = None
+    def _draw_shadows(self, view: CameraView, people: PosedPeople) -> None:
+        """Darken the finished colours where people keep sun and sky from the ground."""
+        context = self.context
+        self._over_color.use()
+        context.enable_only(context.BLEND)
+        context.blend_func = context.DST_COLOR, context.ZERO  # the product of both colours
+        self._depth.use(DEPTH_UNIT)
+        self._tags.use(TAG_UNIT)
+        for person in people.values():
+            feet = feet_of(person, self.origin_m)
+            rectangle = view.rectangle_px(shadow_corners(feet, self._sun))
+            if rectangle is not None:
+                x0, y0, x1, y1 = rectangle
+                self._over_color.scissor = x0, y0, x1 - x0, y1 - y0
+                set_uniform(self._programs.shadow, "feet", feet)
+                self._shadow_triangle.render(vertices=3)
+        self._over_color.scissor = None
 
-    def _draw_scene(self, materials: list[Any], rows: np.ndarray, moving: list[movers.Mover]) -> None:
-        """Draw the movers and these rows of the parts by material, in DRAW_ORDER."""
-        records = np.concatenate([*(mover.records for mover in moving), self._parts.records[rows]])
-        groups = np.concatenate([*(_groups(*mover) for mover in moving), self._part_groups[rows]])
+    def _draw_scene(self, rows: np.ndarray, persons: list[PersonParts]) -> None:
+        """Draw people and these rows of the parts by material, in DRAW_ORDER."""
+        records = np.concatenate([*(person.records for person in persons), self._parts.records[rows]])
+        groups = np.concatenate([*(_groups(*person) for person in persons), self._part_groups[rows]])
         order = np.argsort(groups, kind="stable")
         records = records[order]
         starts = np.searchsorted(groups[order], np.arange(NUM_MATERIALS * MESH_STRIDE + 1))
         for material in DRAW_ORDER:
             for mesh in range(len(self._meshes)):
                 group = material * MESH_STRIDE + mesh
-                self._draw(materials[material], mesh, records[starts[group] : starts[group + 1]])
-            self._loose.draw(materials[material], material)
+                self._draw(self._programs.materials[material], mesh, records[starts[group] : starts[group + 1]])
+            self._loose.draw(self._programs.materials[material], material)
 
     def _draw(self, program: Any, mesh: int, records: np.ndarray) -> None:
         """Draw instances of one mesh."""
@@ -385,11 +379,3 @@ def smoothed(rgb: np.ndarray) -> np.ndarray:
 def _groups(records: np.ndarray, mesh_numbers: np.ndarray) -> np.ndarray:
     """Return a number for each combination of material and mesh, (k,)."""
     return materials_of(records).astype(np.int64) * MESH_STRIDE + mesh_numbers
-
-
-def _bones_of(figure: PersonFigure, origin_m: np.ndarray) -> np.ndarray:
-    """Return the bones of a person as capsules, (b, 2, 4) float32: [start, radius] and [end, 0]."""
-    bones = np.zeros((len(figure.bones_m), 2, 4), np.float32)
-    bones[..., :3] = figure.bones_m - origin_m
-    bones[:, 0, 3] = figure.bone_radii_m
-    return bones

@@ -46,8 +46,8 @@ class Programs:
     """The programs of one kind of weather."""
 
     materials: list[Any]  # one for each material
-    near_movers: list[Any]  # one for each material; they also draw the shadows of movers
     sky: Any
+    shadow: Any  # of one person
     rain: Any  # None in fair weather
 
 
@@ -57,19 +57,21 @@ def programs_of(context: Any, define: str | None, *, snaps: bool) -> Programs:
     Args:
         snaps: Whether the device snaps triangles to a grid, as GPUs do (scene.frag.glsl).
     """
-    sky_files = ("light.glsl", *(FAIR if define is None else WEATHER_SKY), "sky.frag.glsl")
-    scene_files = ("light.glsl", *(FAIR if define is None else WEATHER_SCENE), "scene.frag.glsl")
+    light = ("light.glsl", *(FAIR if define is None else WEATHER_SKY))
+    scene_light = ("light.glsl", *(FAIR if define is None else WEATHER_SCENE))
     defines = ("#define SNAPS\n" if snaps else "") + (define or "")
-    vertex, fragment = sources(("part.glsl", "scene.vert.glsl"), scene_files, defines)
+    vertex, fragment = sources(("part.glsl", "scene.vert.glsl"), (*scene_light, "scene.frag.glsl"), defines)
+    materials = [context.program(vertex, fragment.replace(" MATERIAL;", f" {m};")) for m in range(NUM_MATERIALS)]
 
-    def program(material: int, near: str) -> Any:
-        text = fragment.replace(" MATERIAL;", f" {material};").replace("NEAR_MOVERS;", f"{near};")
-        return context.program(vertex, text)
+    def of_screen(*fragment: str) -> Any:
+        return context.program(*sources(("screen.vert.glsl",), fragment, define or ""))
 
-    materials, near_movers = ([program(m, near) for m in range(NUM_MATERIALS)] for near in ("false", "true"))
-    sky = context.program(*sources(("screen.vert.glsl",), sky_files, define or ""))
-    rain = sources(("screen.vert.glsl",), ("light.glsl", "rain.frag.glsl"))
-    return Programs(materials, near_movers, sky, None if define is None else context.program(*rain))
+    return Programs(
+        materials=materials,
+        sky=of_screen(*light, "sky.frag.glsl"),
+        shadow=of_screen(*scene_light, "shadow.frag.glsl"),
+        rain=None if define is None else of_screen("light.glsl", "rain.frag.glsl"),
+    )
 
 
 def packed(value: Any) -> Any:

@@ -19,12 +19,7 @@ uniform sampler2DShadow shadow_map;
 uniform mat4 shadow_from_world;
 uniform sampler2D height_map;         // blurred height of what stands around, m relative to the origin
 uniform vec4 height_area;             // low x, low y, 1 / size x, 1 / size y
-uniform vec4 person_bones[12];        // pairs: (from xyz, radius), (to xyz, unused)
-uniform int person_num_bones;
-uniform vec3 person_center;
 uniform float ground_z;
-uniform vec4 other_bones[64];         // one capsule for each of the others: (from xyz, radius), (to xyz, instance id)
-uniform int num_others;
 
 layout(location = 0) out vec4 out_color;
 layout(location = 1) out float out_depth;
@@ -36,7 +31,6 @@ const int PLAIN = 0, FACADE = 1, ROAD = 2, SIDEWALK = 3, GRASS = 4, LEAVES = 5, 
     METAL = 10, BRICK = 11, WATER = 12, FENCE = 13, ROAD_LINE = 14, LAMP = 15, GRAVEL = 16, SIGNAL = 17, BUS = 18, CLOTH = 19,
     CONCRETE = 20, TILES = 21;
 const int material = MATERIAL;
-const bool near_movers = NEAR_MOVERS;   // whether this text is for pixels that somebody who moves may darken: two loops that every pixel pays for
 
 // Depth of the surface at the middle of the pixel. Hardware draws triangles as if their corners stood on a grid of 1 / 256 pixel, so that what it
 // interpolates is of a place beside the middle, though of the same plane; the plane is cut with the pixel's ray. llvmpipe has no such grid.
@@ -256,42 +250,6 @@ float sun_reaches(vec3 p, vec3 n) {
     return texture(shadow_map, c.xyz);                                           // compared and blended between four texels
 }
 
-// The ray to the sun against a capsule from a to b: 0 in its shadow, 1 beside it.
-float capsule_lets_sun(vec3 p, vec3 a, vec3 b, float radius) {
-    vec3 u = b - a, w = p - a;
-    float uu = dot(u, u), us = dot(u, sun_direction), uw = dot(u, w), sw = dot(sun_direction, w);
-    float k = clamp((uw - us * sw) / max(uu - us * us, 1e-6), 0.0, 1.0);         // nearest point of the bone to the ray's line
-    vec3 gap = w - k * u;
-    float t = -dot(gap, sun_direction);
-    return t > 0.0 ? smoothstep(0.75, 1.25, length(gap + t * sun_direction) / radius) : 1.0;
-}
-
-// Shadow of the walking person, by the capsules of the body.
-float person_lets_sun(vec3 p) {
-    vec3 d = p - person_center;
-    int count = dot(d, d) > 30.0 ? 0 : person_num_bones;                         // a loop is left early, a branch is not
-    float light = 1.0;
-    for (int i = 0; i < count; i++) {
-        light = min(light, capsule_lets_sun(p, person_bones[2 * i].xyz, person_bones[2 * i + 1].xyz, person_bones[2 * i].w));
-    }
-    return light;
-}
-
-// What the others leave of the sun and of the sky, for everybody but themselves.
-vec2 others_let(vec3 p) {
-    vec2 light = vec2(1.0);
-    float own = float(f_tag >> 16);
-    for (int i = 0; i < num_others; i++) {
-        vec4 a = other_bones[2 * i], b = other_bones[2 * i + 1];
-        if (b.w == own) continue;
-        light.x = min(light.x, capsule_lets_sun(p, a.xyz, b.xyz, a.w));
-        vec2 u = b.xy - a.xy, w = p.xy - a.xy;
-        vec2 d = w - clamp(dot(u, w) / max(dot(u, u), 1e-6), 0.0, 1.0) * u;
-        light.y = min(light.y, 1.0 - 0.45 * exp(-0.36 * dot(d, d) / (a.w * a.w)) * step(p.z, max(a.z, b.z)));
-    }
-    return light;
-}
-
 void main() {
     vec3 footprint = max(fwidth(v_local), vec3(1e-4));
     float w = max(footprint.x, max(footprint.y, footprint.z));
@@ -406,19 +364,9 @@ void main() {
     float sun = mix(max(facing, 0.0), 0.5 + 0.5 * facing, translucent);
     if (sun > 0.001 && (dot(geometric, sun_direction) > 0.0 || translucent > 0.0)) {
         sun *= sun_reaches(v_world, geometric);
-        if (near_movers && material != CLOTH) sun *= person_lets_sun(v_world);
     } else sun = 0.0;
     float around = texture(height_map, (v_world.xy - height_area.xy) * height_area.zw).r - v_world.z;
     float open_sky = 1.0 / (1.0 + 0.16 * max(around, 0.0));
-    if (near_movers && person_num_bones > 0 && material != CLOTH) {
-        vec2 d = v_world.xy - person_center.xy;
-        open_sky *= 1.0 - 0.45 * exp(-9.0 * dot(d, d)) * step(v_world.z, person_center.z);
-    }
-    if (near_movers && num_others > 0) {
-        vec2 light = others_let(v_world);
-        sun *= light.x;
-        open_sky *= light.y;
-    }
     vec3 ambient = mix(ground_light, sky_light, 0.5 + 0.5 * s.normal.z) * open_sky * s.shade;
     vec3 light = sun_light * sun * mix(1.0, s.shade, 0.5) + ambient;
     vec3 lamp = vec3(0.0);
@@ -462,8 +410,7 @@ void main() {
 #ifdef WEATHER
     color = mix(fog_color + 0.35 * lamp, color, seen_through(distance_m));
 #else
-    float far = distance_m / haze_m, haze = 1.0 - exp(-far * sqrt(far));
-    color = mix(color, horizon_color(), haze);
+    color = mix(horizon_color(), color, seen_through(distance_m));
 #endif
 
     out_color = vec4(toned(color), 1.0);

@@ -16,7 +16,6 @@ out vec3 v_from_camera;           // in the world's axes, where most planes are 
 flat out vec3 f_half;
 flat out vec4 f_color;
 flat out uint f_tag;
-invariant gl_Position;            // what is drawn twice is nowhere nearer the second time
 
 void main() {
     v_local = in_position * in_half;

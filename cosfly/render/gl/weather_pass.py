@@ -216,12 +216,12 @@ def defines(params: WeatherParams) -> str:
 class WeatherPass:
     """The weather of a trajectory on one GL context."""
 
-    def __init__(self, context: Any, color: Any, depth: Any, rain_program: Any) -> None:
+    def __init__(self, context: Any, over_color: Any, depth: Any, rain_program: Any) -> None:
         self._context = context
         self._depth = depth
         self._rain_program = rain_program
         self._rain = context.vertex_array(rain_program, [])
-        self._over_color = context.framebuffer([color])
+        self._over_color = over_color
         self._lamp_map = context.texture((MAP_PX, MAP_PX), 2, dtype="f4")
         self._lamp_map.repeat_x = self._lamp_map.repeat_y = False
         self.values: dict[str, Any] = {}
@@ -246,7 +246,6 @@ class WeatherPass:
             "lamp_area": area,
             "lamp_map": LAMP_UNIT,
             "wind": np.array(WIND),
-            "depth_map": DEPTH_UNIT,
         }
 
     @property
