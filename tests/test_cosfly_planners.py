@@ -24,9 +24,8 @@ from cosfly.geometry.axes import look_at
 from cosfly.geometry.grid import connected_parts
 from cosfly.pedestrians.astar import find_route, route_cost
 from cosfly.planners import foresight, smoothing, track_astar
-from cosfly.planners.contract import MucoConfig, PlanConfig, Scenario, TrackAStarConfig
+from cosfly.planners.contract import PlanConfig, Scenario, TrackAStarConfig
 from cosfly.planners.muco import loss, muco, nearby, step
-from cosfly.planners.muco.nearby import nothing_nearby
 from cosfly.planners.reference_trajectory import follow
 from cosfly.planners.stage import make_scenario, plan_on
 from cosfly.runtime.errors import ResumeError
@@ -124,55 +123,6 @@ def test_the_loss_never_rises_and_the_flight_is_safe(world):
     if len(points) > 20:
         assert history[-1] < 0.8 * history[0]
     np.testing.assert_array_equal(points[[0, -1]], first[[0, -1]])
-
-
-def papers_losses(points, problem, obstacles, cfg, num_steps):
-    """The paper's outer loop, slowly: central differences of the whole loss, capped steps, the projection, whatever the
-    loss does.
-    """
-    points, low = points.copy(), problem.altitudes[0, 0]
-    losses, num_infeasible = [sum(plain_terms(points, problem, obstacles).values())], 0
-
-    def smooth_loss(places):
-        return sum(value for name, value in plain_terms(places, problem, obstacles).items() if name != "visibility")
-
-    for _ in range(num_steps):
-        state = loss.make_state(len(points), len(obstacles.rows))
-        loss.evaluate(points, problem, obstacles, np.zeros(len(points), dtype=bool), state)
-        slope = state.visibility_gradient.copy()  # a central difference over the same window
-        for i in range(1, len(points) - 1):
-            for axis in range(3):
-                ends = [points.copy(), points.copy()]
-                for side, end in zip((-1, 1), ends, strict=True):
-                    end[i, axis] += side * cfg.difference_m
-                    end[i, 2] = max(end[i, 2], low)
-                slope[i, axis] += (smooth_loss(ends[1]) - smooth_loss(ends[0])) / (ends[1] - ends[0])[i, axis]
-        steps = -cfg.learning_rate * slope[1:-1]
-        lengths = np.linalg.norm(steps, axis=1, keepdims=True)
-        points[1:-1] += steps * np.minimum(1.0, cfg.step_cap_m / np.maximum(lengths, 1e-12))
-        num_infeasible += not step.project(points, problem, obstacles, 1, len(points) - 1, nothing_nearby(len(points)))
-        losses.append(sum(plain_terms(points, problem, obstacles).values()))
-    return np.array(losses), num_infeasible
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("world", ["corner", "tower_midway"])
-def test_the_papers_optimizer_is_the_one_that_is_printed(world, monkeypatch):
-    """It overshoots, goes on all the same, over infeasible trajectories too, and gives the last feasible one, not
-    converged.
-    """
-    scenario, obstacles = scenario_of(world)
-    scenario = first_points(scenario, 16)
-    problem = muco.make_problem(scenario, CFG)
-    first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
-    monkeypatch.setattr(MucoConfig, "iterations_max", 5)
-    cfg = MucoConfig(step="paper")
-    points, plain, history = muco.optimize(first, problem, obstacles, cfg)
-    expected, _ = papers_losses(first, problem, obstacles, cfg, 5)
-    np.testing.assert_allclose(history, expected, rtol=1e-6)
-    assert (np.diff(expected) > 0).any()
-    assert (plain["stopped"], plain["iterations"]) == ("iteration_limit", 5)
-    assert_safe(points, obstacles)
 
 
 @pytest.mark.parametrize("world", ["corner", "tower_midway"])

@@ -24,7 +24,7 @@ import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
 from cosfly.formats.traces import DroneTrace, write_traces
-from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, PlanConfig, known_planner, planner_notes, title_of
+from cosfly.planners.contract import ALL_PLANNERS, NOTES, PLANNERS, PlanConfig, known_planner, title_of
 from cosfly.planners.overview import draw_compared
 from cosfly.planners.stage import load_obstacles, make_items, plan_trajectory, read_inputs, warm_up
 from cosfly.runtime.config import Distinct
@@ -294,7 +294,10 @@ def run(
         raise stage.nothing_kept(done.tally, expected="a pedestrian trajectory that at least one planner can follow")
     planned = {record.id: result_of(record, PlannedItem) for record in done.kept}
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.all_values()}
-    facts = {"planners": {name: ALL_PLANNERS[name] for name in cfg.planners}, "notes": planner_notes(cfg.planners, cfg)}
+    facts = {
+        "planners": {name: ALL_PLANNERS[name] for name in cfg.planners},
+        "notes": {name: NOTES[name] for name in cfg.planners if name in NOTES},
+    }
     write_json(product, {**FORMAT.header, **header, **facts, **summarize(planned, cfg.planners)})
     planned_traces = [item.read_traces(path_id) for path_id, item in planned.items()]
     traces = {name: [by_planner[name] for by_planner in planned_traces if name in by_planner] for name in cfg.planners}

@@ -12,7 +12,7 @@ every planner. Only planners import compiled code, so this module and the settin
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -49,21 +49,16 @@ TITLES = {
     "astar": "3D A*", "weighted_astar": "weighted A*", "theta_star": "Theta*", "visibility_astar": "visibility-A*",
     "chomp": "CHOMP-lite", "trajopt": "L-BFGS-B TrajOpt",
 }  # fmt: skip
-SMOOTHING_NOTE = "the paper's search, our least-squares smoothing instead of its shortcuts and elastic band"
-STEP_NOTE = "the paper's loss, our Newton step and a repair to plan.accel_max_mps2; muco.step=paper has neither"
+# How planners with the names of the paper's planners differ from those.
+NOTES = {
+    "track_astar": "the paper's search, our least-squares smoothing instead of its shortcuts and elastic band",
+    "muco": "the paper's loss, our Newton step and a repair to plan.accel_max_mps2",
+}
 
 
 def title_of(name: str) -> str:
     """Return a planner's title for tables and pictures."""
     return TITLES.get(name, name.replace("_", " "))
-
-
-def planner_notes(names: Iterable[str], cfg: PlanConfig) -> dict[str, str]:
-    """Return, for planners with the names of the paper's planners, how they differ from those."""
-    notes = {"track_astar": SMOOTHING_NOTE}
-    if cfg.muco.step == "newton":
-        notes["muco"] = STEP_NOTE
-    return {name: notes[name] for name in names if name in notes}
 
 
 def known_planner(name: str) -> str:
@@ -79,7 +74,7 @@ def known_planner(name: str) -> str:
 
 
 class MucoConfig(Config):
-    """Settings of MuCO (subsec:appendix_planner_muco), which minimizes the paper's loss in one of two ways (`step`)."""
+    """Settings of MuCO (subsec:appendix_planner_muco), which minimizes the paper's loss."""
 
     track_distance_m: ClassVar[float] = 28.0  # preferred slant distance to the target, m
     weight_tracking: ClassVar[float] = 2.0  # weight of (distance - track_distance_m)^2
@@ -100,16 +95,10 @@ class MucoConfig(Config):
     pitch_band_deg: ClassVar[tuple[float, float]] = (30.0, 60.0)  # pitch outside costs extra, degrees
     low_visibility: ClassVar[float] = 0.3  # visibility below this is low
     low_visibility_frames: ClassVar[int] = 20  # in a row: visibility and view angle leave the gradient
-    step: Literal["newton", "paper"] = Field(
-        "newton",
-        description="newton: our band-matrix step, shortened until the loss falls, and a repair to "
-        "plan.accel_max_mps2; paper: steps along finite differences as in the paper, without shortening and repair",
-    )
     difference_m: ClassVar[float] = 0.5  # half width of the difference window, m
-    learning_rate: ClassVar[float] = 0.05  # of step paper; step newton has none
     step_cap_m: ClassVar[float] = 0.5  # longest move of a waypoint in one iteration, m
     iterations_max: ClassVar[int] = 1500  # largest number of iterations
-    tolerance: ClassVar[float] = 1e-5  # converged when the loss changes by less: relative (newton) or absolute (paper)
+    tolerance: ClassVar[float] = 1e-5  # converged when the relative change of the loss is less
     pushes_max: ClassVar[int] = 10  # pushes out of obstacles per waypoint and projection, at most
     start_visibility: ClassVar[float] = 0.95  # of a start behind the target; below it a start is searched for; 0: never
 
@@ -133,7 +122,7 @@ class PlanConfig(Config):
     """Settings of step 4, for all planners (tab:drone_params); altitudes count from the ground under the target."""
 
     planner: str = Field(
-        "foresight", description=f"foresight (ours), muco ({STEP_NOTE}) or track_astar ({SMOOTHING_NOTE})"
+        "foresight", description=f"foresight (ours), muco ({NOTES['muco']}) or track_astar ({NOTES['track_astar']})"
     )
     safety_distance_m: float = Field(limits.SAFETY_DISTANCE_M, gt=0, description="nominal distance to obstacles, m")
     relaxed_safety_m: float = Field(
@@ -146,9 +135,7 @@ class PlanConfig(Config):
         20.0, gt=0, description="horizontal distance of the style follow, m; at the start only for muco and track_astar"
     )
     speed_max_mps: float = Field(10.0, gt=0, description="greatest speed between two waypoints, m/s")
-    accel_max_mps2: float = Field(
-        5.0, gt=0, description="greatest acceleration between steps, m/s^2; ignored by muco.step=paper"
-    )
+    accel_max_mps2: float = Field(5.0, gt=0, description="greatest acceleration between steps, m/s^2")
     yaw_rate_max_degps: IfChanged[float] = Field(
         limits.YAW_RATE_MAX_DEGPS, gt=0, le=720, description="greatest yaw rate of the camera, also for inspect, deg/s"
     )

@@ -347,28 +347,3 @@ def _add_lengths(points, begin, end, weight, state):
                     band[a - b, 3 * i + 3 + b] += value
                 band[3 + a - b, 3 * i + b] -= value  # row: axis a of waypoint i + 1, column: axis b of waypoint i
     state.terms[PATH_LENGTH] += weight * total
-
-
-@njit(cache=True)
-def difference_gradient(points, problem, index, masked, state, gradient):
-    """Write the paper's gradient, (n, 3): central differences of +-difference_m of the terms of each waypoint.
-
-    Altitudes stay within their bounds, or the penalty below the least altitude would lift every waypoint that is at it.
-    The visibility term, whose own gradient is a difference already, is excluded; `state` is overwritten.
-    """
-    state.contacts.fill(0.0)
-    for i in range(len(points)):
-        for axis in range(3):
-            losses, places = np.zeros(2), np.zeros(2)
-            middle = points[i, axis]
-            for side in range(2):
-                places[side] = middle + (2 * side - 1) * problem.difference_m
-                if axis == 2:
-                    places[side] = min(max(places[side], problem.altitudes[i, LEAST]), problem.altitudes[i, GREATEST])
-                points[i, axis] = places[side]
-                state.terms.fill(0.0)
-                point_terms(points, i, i + 1, problem, index, masked, state)
-                chain_terms(points, i - 3, i + 1, problem, state)
-                losses[side] = state.terms.sum() - (state.terms[VIEW_ANGLE] if masked[i] else 0.0)
-            points[i, axis] = middle
-            gradient[i, axis] = (losses[1] - losses[0]) / max(places[1] - places[0], 1e-9)

@@ -1,9 +1,9 @@
 """MuCO: one trajectory, optimised as a whole against seven terms (subsec:appendix_planner_muco).
 
 The loss is the paper's. Its plain gradient step overshoots with its own weights: 0.05 times a curvature of several
-hundred is far beyond two, so its waypoints oscillate by the step cap. Our default step solves the band system of the
+hundred is far beyond two, so its waypoints oscillate by the step cap. Our step solves the band system of the
 Gauss-Newton model instead, caps it per waypoint, projects, and is shortened until the loss falls; then the trajectory
-is repaired to `plan.accel_max_mps2`. `step: paper` is the paper's optimizer as printed, without that limit.
+is repaired to `plan.accel_max_mps2`.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from cosfly.planners.contract import MucoConfig, Plan, PlanConfig, Scenario
 from cosfly.planners.foresight import SPEED_SHARE, cheapest_way, places_on_rings
 from cosfly.planners.muco.loss import TERM_NAMES, Problem, make_state
 from cosfly.planners.muco.nearby import nothing_nearby
-from cosfly.planners.muco.step import STOP_REASONS, Rules, descend, descend_paper, is_feasible, project
+from cosfly.planners.muco.step import STOP_REASONS, Rules, descend, is_feasible, project
 from cosfly.planners.smoothing import repair_to_limits
 from cosfly.runtime.compiled import njit
 
@@ -158,8 +158,7 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
     problem = make_problem(scenario, cfg)
     start, kind = start_trajectory(scenario, problem, obstacles, cfg)
     points, solver, _ = optimize(start, problem, obstacles, cfg.muco)
-    limits = cfg.model_copy(update={"accel_max_mps2": np.inf}) if cfg.muco.step == "paper" else cfg
-    points = repair_to_limits(points, scenario, obstacles, limits)
+    points = repair_to_limits(points, scenario, obstacles, cfg)
     return Plan(points, {"start": kind, **solver}, is_converged=solver["stopped"] in CONVERGED_REASONS)
 
 
@@ -238,8 +237,7 @@ def optimize(
     rules = Rules(*(getattr(cfg, name) for name in Rules._fields))  # compiled code takes no models
     state, spare = (make_state(len(points), len(obstacles.rows)) for _ in range(2))
     spare = spare._replace(nearby=state.nearby)  # both evaluate trajectories near each other: one cache of boxes
-    search = descend_paper if cfg.step == "paper" else descend
-    points, state, masked, num_iterations, num_tried, reason = search(
+    points, state, masked, num_iterations, num_tried, reason = descend(
         points, problem, obstacles, rules, (state, spare), history
     )
     facts = {

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cosfly.geometry.kernels import collect_hits, nearest_box, normal_of_box
-from cosfly.planners.muco.loss import BAND_ROWS, GREATEST, LEAST, difference_gradient, evaluate, remember_boxes
+from cosfly.planners.muco.loss import BAND_ROWS, GREATEST, LEAST, evaluate, remember_boxes
 from cosfly.planners.muco.nearby import nearest_among, nearest_of, num_cached
 from cosfly.runtime.compiled import boolean, int64, njit
 
@@ -25,15 +25,13 @@ PUSH_EXTRA_M = 1e-6  # beyond the safety distance, so that rounding does not lea
 CONTACT_CURVATURE = 1e5  # across the face of a touched obstacle: allows only steps along the face
 ALTITUDE_CURVATURE = 1e7  # in z at an altitude bound: keeps the waypoint at the bound
 
-# no_step: no step of any tried length lowers the loss. infeasible: converged to a trajectory that breaks a bound.
-STOP_REASONS = ("converged", "iteration_limit", "no_step", "infeasible")
-CONVERGED, ITERATION_LIMIT, NO_STEP, INFEASIBLE = range(4)
+STOP_REASONS = ("converged", "iteration_limit", "no_step")  # no_step: no step of any tried length lowers the loss
+CONVERGED, ITERATION_LIMIT, NO_STEP = range(3)
 
 
 class Rules(NamedTuple):
     """Settings of the search: the fields of MucoConfig with the same names."""
 
-    learning_rate: float
     step_cap_m: float
     tolerance: float
     low_visibility: float
@@ -117,20 +115,6 @@ def try_step(points, steps, scale, cap_m, as_a_whole, problem, index, masked, st
     Returns:
         The loss of the trial, infinity if it is not feasible, and whether any step was longer than the cap.
     """
-    longest = move(points, steps, scale, cap_m, as_a_whole, trial)
-    loss = np.inf
-    if project(trial, problem, index, int64(1), len(trial) - 1, state.nearby):
-        loss = evaluate(trial, problem, index, masked, state)
-    return loss, longest > cap_m
-
-
-@njit(cache=True)
-def move(points, steps, scale, cap_m, as_a_whole, trial):
-    """Write the points after the capped steps of `try_step` to `trial`, (n, 3).
-
-    Returns:
-        The length of the longest step before the cap, m.
-    """
     lengths = np.empty(len(steps))
     longest = 0.0
     last = len(points) - 1
@@ -144,7 +128,10 @@ def move(points, steps, scale, cap_m, as_a_whole, trial):
         share = scale * min(1.0, cap_m / max(length, 1e-12))
         for axis in range(3):
             trial[i + 1, axis] = points[i + 1, axis] + share * steps[i, axis]
-    return longest
+    loss = np.inf
+    if project(trial, problem, index, int64(1), last, state.nearby):
+        loss = evaluate(trial, problem, index, masked, state)
+    return loss, longest > cap_m
 
 
 @njit(cache=True)
@@ -224,7 +211,7 @@ def descend(points, problem, index, rules, states, history):
     for iteration in range(1, len(history)):
         trial_loss = np.inf
         if visibility_pause == 0 and now.visibility_gradient.any():
-            gradient = _scaled_sum(now.gradient, now.visibility_gradient, 1.0)
+            gradient = _sum_of(now.gradient, now.visibility_gradient)
             trial_loss, tried = newton_step(
                 points, loss, gradient, damping, int64(TRIES_WITH_VISIBILITY), rules, problem, index, masked, now,
                 spare, trial,
@@ -258,46 +245,6 @@ def descend(points, problem, index, rules, states, history):
 
 
 @njit(cache=True)
-def descend_paper(points, problem, index, rules, states, history):
-    """Run the paper's optimizer: plain steps along finite differences, capped per waypoint and projected.
-
-    The loss may rise. An infeasible trajectory does not stop the search. The search converges when the loss changes by
-    less than the tolerance, which is absolute here.
-
-    Args and Returns: as for `descend`; the returned trajectory is the last feasible one.
-    """
-    now, spare = states
-    best = points.copy()
-    trial = points.copy()
-    gradient = np.empty_like(points)
-    masked = np.zeros(len(points), dtype=np.bool_)
-    is_free = True
-    reason = ITERATION_LIMIT
-    remember_boxes(points, problem, index, now.nearby)
-    history[0] = evaluate(points, problem, index, masked, now)
-    num_done = 0
-    for iteration in range(1, len(history)):
-        masked = update_mask(points, problem, index, rules, masked, now)
-        difference_gradient(points, problem, index, masked, spare, gradient)
-        steps = _scaled_sum(gradient, now.visibility_gradient, -rules.learning_rate)[1:-1]
-        move(points, steps, 1.0, rules.step_cap_m, boolean(False), trial)
-        is_free = project(trial, problem, index, int64(1), len(trial) - 1, now.nearby)
-        points, trial = trial, points
-        num_done = iteration
-        remember_boxes(points, problem, index, now.nearby)
-        history[iteration] = evaluate(points, problem, index, masked, now)
-        if is_free:
-            best = points.copy()
-        if abs(history[iteration] - history[iteration - 1]) < rules.tolerance:
-            reason = CONVERGED if is_free else INFEASIBLE
-            break
-    if not is_free:
-        remember_boxes(best, problem, index, now.nearby)
-        evaluate(best, problem, index, masked, now)
-    return best, now, masked, num_done, num_done, reason
-
-
-@njit(cache=True)
 def update_mask(points, problem, index, rules, masked, state):
     """Return which waypoints are in low-visibility runs, (n,) bool; evaluate `state` again where `masked` differs.
 
@@ -312,12 +259,12 @@ def update_mask(points, problem, index, rules, masked, state):
 
 
 @njit(cache=True)
-def _scaled_sum(left, right, factor):
-    """Return factor * (left + right), (n, 3)."""
+def _sum_of(left, right):
+    """Return left + right, (n, 3)."""
     total = np.empty_like(left)
     for i in range(len(left)):
         for axis in range(3):
-            total[i, axis] = factor * (left[i, axis] + right[i, axis])
+            total[i, axis] = left[i, axis] + right[i, axis]
     return total
 
 
