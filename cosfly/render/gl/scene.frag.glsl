@@ -73,15 +73,11 @@ vec3 brick_pattern(vec2 p, vec2 w, vec3 color) {
     return mix(color * (0.82 + 0.36 * tone), vec3(0.45, 0.42, 0.38), 0.6 * joint);
 }
 
-// Distance to the nearest edge of a top face that is open: bits of the whole part of the seed, -x, +x, -y, +y.
-float open_edge(vec3 p, vec3 h) {
-    vec4 is_open = mod(floor(vec4(f_color.a) / vec4(1.0, 2.0, 4.0, 8.0)), 2.0);
-    vec4 to_edge = vec4(h.x + p.x, h.x - p.x, h.y + p.y, h.y - p.y) + 99.0 * (1.0 - is_open);
-    return min(min(to_edge.x, to_edge.y), min(to_edge.z, to_edge.w));
-}
+// Distance to the nearest edge of the top face of a box. A mesh has no seed of 1 or more: its outline is not that of its part.
+float to_edge(vec3 p, vec3 h) { return material == SIDEWALK || f_color.a >= 1.0 ? min(h.x - abs(p.x), h.y - abs(p.y)) : 99.0; }
 
 void roof(inout Surface s, vec3 p, vec3 h, float seed, float w) {
-    float edge = open_edge(p, h);
+    float edge = to_edge(p, h);
     float kind = fract(seed * 31.7);
     vec3 base = kind < 0.4 ? vec3(0.27, 0.26, 0.25) : kind < 0.7 ? vec3(0.16, 0.165, 0.175) : kind < 0.85 ? vec3(0.36, 0.33, 0.29) : vec3(0.20, 0.25, 0.15);
     float weathered = noise2(p.xy * 0.35 + seed * 50.0);
@@ -215,7 +211,7 @@ void ground_cover(inout Surface s, vec2 p, vec3 local, vec3 h, float w) {
         float joint = max(stripes(p.x / 0.9, 0.03, w / 0.9), stripes(p.y / 0.6, 0.045, w / 0.6));
         s.albedo *= 0.86 + 0.14 * patches + 0.16 * medium * (hash21(cell) - 0.5) + 0.14 * (grain(p, 40.0, w) - 0.5);
         s.albedo *= 1.0 - 0.45 * joint;
-        float edge = open_edge(local, h);                                        // the kerb
+        float edge = to_edge(local, h);                                        // the kerb
         s.albedo = mix(s.albedo, vec3(0.43, 0.42, 0.40) * (1.0 - 0.5 * stripes(p.x + p.y, 0.02, w)), 0.8 * stripe(edge, -1.0, 0.18, w));
     } else if (material == GRASS) {
         float tufts = mix(0.5, noise2(p * 2.7), medium), blades = grain(p, 26.0, w) - 0.5;

@@ -13,8 +13,7 @@ from cosfly.render import contract
 from cosfly.render.gl import meshes, parts
 from cosfly.render.gl.parts import FAR_PX, Boxes, Parts
 
-EDGE_GAP_M = 0.05  # an edge is open if no box is this near
-MOST_EDGED = 4000  # boxes; edges of more are not searched
+HAS_RIM = 1.0  # added to the seeds of boxes whose roofs have a rim
 
 BUILDING_COLORS = np.array([
     [0.46, 0.23, 0.16], [0.55, 0.31, 0.21], [0.66, 0.59, 0.47], [0.60, 0.57, 0.52], [0.73, 0.68, 0.58],
@@ -34,7 +33,6 @@ CAR_COLORS = np.array([
     [0.23, 0.25, 0.27], [0.10, 0.17, 0.13], [0.48, 0.40, 0.28],
 ])  # fmt: skip
 SIGN_COLORS = np.array([[0.55, 0.03, 0.03], [0.04, 0.12, 0.45], [0.75, 0.75, 0.72], [0.60, 0.42, 0.02]])
-COAT_COLORS = np.array([[0.10, 0.12, 0.20], [0.30, 0.08, 0.07], [0.12, 0.20, 0.13], [0.35, 0.30, 0.22]])
 LEAF_COLORS = np.array(
     [[0.085, 0.165, 0.035], [0.11, 0.19, 0.045], [0.065, 0.135, 0.035], [0.15, 0.20, 0.05], [0.075, 0.155, 0.055]]
 )
@@ -48,45 +46,14 @@ def _box(material: int, color: tuple[float, float, float], layer: int | None = N
     return lambda boxes: [boxes.part(meshes.BOX, boxes.half, material, color, layer=layer)]
 
 
-def _sidewalks(boxes: Boxes) -> list[Parts]:
-    """Return pavement; the shader draws a kerb along the open edges, which the seed encodes."""
-    boxes = replace(boxes, seeds=_open_edges(boxes, height_share=0.0, slack_m=1.0))
-    return [boxes.part(meshes.BOX, boxes.half, parts.SIDEWALK, (0.36, 0.345, 0.32), layer=LAYERS["Sidewalks"])]
-
-
-def _open_edges(boxes: Boxes, height_share: float, slack_m: float) -> np.ndarray:
-    """Find the edges without an adjacent box of the kind.
-
-    Args:
-        height_share: Place along the height, -1 the bottom, 1 the top. slack_m: Tolerance of the height.
-
-    Returns:
-        (n,) numbers of bits -x, +x, -y, +y; 0 for more than MOST_EDGED boxes.
-    """
-    bits = np.zeros(len(boxes))
-    reach = boxes.half + np.array([0.0, 0.0, slack_m])
-    if len(boxes) > MOST_EDGED:
-        return bits
-    for bit, (axis, side) in enumerate(((0, -1.0), (0, 1.0), (1, -1.0), (1, 1.0))):
-        is_open = np.zeros(len(boxes), dtype=bool)
-        for share in (-0.9, 0.0, 0.9):
-            local = boxes.half * np.where(np.arange(3) == 2, height_share, share)
-            local[:, axis] = side * (boxes.half[:, axis] + EDGE_GAP_M)
-            for row, probe in enumerate(boxes.centers + np.einsum("nij,nj->ni", boxes.turns, local)):
-                inside = np.abs(np.einsum("nji,nj->ni", boxes.turns, probe - boxes.centers)) <= reach
-                is_open[row] |= not inside.all(axis=1).any()
-        bits += 2.0**bit * is_open
-    return bits
-
-
 def _plain(boxes: Boxes) -> list[Parts]:
     return [boxes.part(meshes.BOX, boxes.half, parts.PLAIN, boxes.pick(PLAIN_COLORS))]
 
 
 def _buildings(boxes: Boxes) -> list[Parts]:
-    """Return houses; the shader draws storeys, windows and a roof rim along the open edges (the seed's whole part)."""
-    edged = replace(boxes, seeds=boxes.seeds * 0.999 + _open_edges(boxes, height_share=0.98, slack_m=0.0))
-    return [edged.part(meshes.BOX, boxes.half, parts.FACADE, boxes.pick(BUILDING_COLORS))]
+    """Return houses; the shader draws storeys, windows and the rim of a roof."""
+    rimmed = replace(boxes, seeds=boxes.seeds * 0.999 + HAS_RIM)
+    return [rimmed.part(meshes.BOX, boxes.half, parts.FACADE, boxes.pick(BUILDING_COLORS))]
 
 
 def _vegetation(boxes: Boxes) -> list[Parts]:
@@ -270,22 +237,11 @@ def _signs(boxes: Boxes) -> list[Parts]:
     return [_pole(boxes, 0.04), board]
 
 
-def _people(boxes: Boxes) -> list[Parts]:
-    """Return standing people of the map: trousers, coat, head."""
-    h = boxes.half
-    coats = boxes.pick(COAT_COLORS)
-    return [
-        boxes.part(meshes.LIMB, h * [0.5, 0.6, 0.46], parts.CLOTH, (0.05, 0.06, 0.09), offset=h * [0, 0, -0.54]),
-        boxes.part(meshes.ROUNDED, h * [0.55, 0.85, 0.36], parts.CLOTH, coats, offset=h * [0, 0, 0.28]),
-        boxes.part(meshes.SPHERE, h * [0.34, 0.3, 0.15], parts.CLOTH, (0.5, 0.32, 0.22), offset=h * [0, 0, 0.82]),
-    ]
-
-
 SHAPES: dict[int, Shape] = {
     KINDS[name]: build
     for name, build in {
         "Roads": _box(parts.ROAD, (0.095, 0.095, 0.1), LAYERS["Roads"]),
-        "Sidewalks": _sidewalks,
+        "Sidewalks": _box(parts.SIDEWALK, (0.36, 0.345, 0.32), LAYERS["Sidewalks"]),
         "Terrain": _box(parts.GRASS, (0.105, 0.14, 0.045), LAYERS["Terrain"]),
         "Ground": _box(parts.GRAVEL, (0.30, 0.275, 0.235), LAYERS["Ground"]),
         "RoadLines": _box(parts.ROAD_LINE, (0.62, 0.62, 0.6), LAYERS["RoadLines"]),
@@ -300,7 +256,6 @@ SHAPES: dict[int, Shape] = {
         "TrafficLight": _traffic_lights,
         "TrafficSigns": _signs,
         "Vegetation": _vegetation,
-        "Pedestrians": _people,
         "Car": _cars,
         "Truck": _trucks,
         "Bus": _buses,
@@ -310,7 +265,7 @@ SHAPES: dict[int, Shape] = {
         "Rider": _two_wheelers,
     }.items()
 }
-_AS_THEY_LIE = (_plain, _buildings, _vegetation, _people)
+_AS_THEY_LIE = (_plain, _buildings, _vegetation)
 
 
 def parts_of(boxes: Boxes) -> list[Parts]:
