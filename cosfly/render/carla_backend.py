@@ -34,6 +34,7 @@ HEALTH_CHECKS = 3  # in a row that fail: the worker ends
 PICTURE_SHARE = 1 / 3  # of timeout_s, in which a picture must come after its tick
 SENSORS = {"rgb": "rgb", "depth": "depth", "tags": "instance_segmentation"}
 SAME_BOX_M = 0.05
+PERSON_KEY = KINDS["Pedestrians"] << 16  # in the table of ids, plus the 16 bits of a picture
 # Fixed exposure and no motion blur.
 RGB_ATTRIBUTES = {"exposure_mode": "manual", "motion_blur_intensity": "0.0", "motion_blur_max_distortion": "0.0"}
 SPAWN_M = 300.0  # over the map, where the air is free
@@ -226,16 +227,13 @@ class CarlaRenderer(SimulatorRenderer):
         walker = self._walkers[number] = self._spawned(self._library.find(name), self._far_up())
         walker.set_collisions(False)
         walker.set_enable_gravity(False)
-        self._note(walker, number)
+        self._ids[PERSON_KEY | walker.id & ACTOR_BITS] = number
         return walker
 
     def _remove(self, number: int) -> None:
-        actor = self._walkers.pop(number)
-        self._note(actor, NO_INSTANCE)
-        actor.destroy()
-
-    def _note(self, actor: Any, number: int) -> None:
-        self._ids[KINDS["Pedestrians"] << 16 | actor.id & ACTOR_BITS] = number
+        walker = self._walkers.pop(number)
+        self._ids[PERSON_KEY | walker.id & ACTOR_BITS] = NO_INSTANCE
+        walker.destroy()
 
     def _spawned(self, blueprint: Any, transform: Any) -> Any:
         actor = self._world.spawn_actor(blueprint, transform)

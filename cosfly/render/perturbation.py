@@ -28,7 +28,7 @@ from cosfly.formats.playback import EVENTS
 from cosfly.geometry.axes import DT_S, look_at, project, rotation_matrices, world_from_camera, wrap_deg
 from cosfly.geometry.kernels import obstacle_index, signed_distances, visibility
 from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_M, YAW_RATE_MAX_DEGPS
-from cosfly.render.contract import NEAR_M, plane_z_m
+from cosfly.render.contract import NEAR_M
 from cosfly.render.person import NO_BYSTANDERS, DressedBystanders
 from cosfly.runtime.config import Config, IfChanged
 from cosfly.runtime.seeding import draw_smooth
@@ -132,28 +132,17 @@ class Surroundings:
         self._half = slabs.half_extents
         self._turns = rotation_matrices(np.radians(slabs.rotations_deg))
         self._tops = slabs.maxs[:, 2]
-        self._bottoms = slabs.mins[:, 2]
-        self._plane_m = plane_z_m(box_map)
 
     def surface_z_m(self, x_m: float, y_m: float, near_z_m: float) -> float:
         """Return the height of the surface at a place, m.
 
         It is that of the highest slab within STEP_UP_M of `near_z_m`, or `near_z_m` itself if there is none.
         """
-        over = self._slabs_at(x_m, y_m) & (np.abs(self._tops - near_z_m) <= STEP_UP_M)
-        return float(self._tops[over].max()) if over.any() else near_z_m
-
-    def below_ground_m(self, position_m: np.ndarray) -> float:
-        """Return how far a position, (3,), is below the top of the ground's slabs, m; 0 above it."""
-        x_m, y_m, z_m = position_m.tolist()
-        inside = self._slabs_at(x_m, y_m) & (self._bottoms < z_m)
-        return max(0.0, self._plane_m - z_m, float(self._tops[inside].max(initial=-np.inf)) - z_m)
-
-    def _slabs_at(self, x_m: float, y_m: float) -> np.ndarray:
-        """Return which slabs of the ground contain a place in the top view, (n,) bool."""
         offset = np.column_stack([x_m - self._centers[:, 0], y_m - self._centers[:, 1], np.zeros(len(self._centers))])
         local = np.einsum("nji,nj->ni", self._turns, offset)
-        return (np.abs(local[:, :2]) <= self._half[:, :2]).all(axis=1)
+        is_inside = (np.abs(local[:, :2]) <= self._half[:, :2]).all(axis=1)  # in the top view
+        over = is_inside & (np.abs(self._tops - near_z_m) <= STEP_UP_M)
+        return float(self._tops[over].max()) if over.any() else near_z_m
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, 
 from cosfly.render.person import choose_clothes, dress_bystanders, gait_of
 from cosfly.render.perturbation import PERTURBED, PerturbedTrack, Poses, Surroundings, perturb
 from cosfly.render.settings import RenderConfig
-from cosfly.render.track import VARIANTS, TrackScript, check_track, render_track
+from cosfly.render.track import VARIANTS, TrackScript, render_track
 from cosfly.render.weather import random_seed, read_pools, weathers_of
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, InputError
@@ -292,7 +292,6 @@ def make_worker(cfg: RenderConfig, inputs: Inputs, out: Path, town: str, seed: i
     def work(item: Item) -> Outcome:
         number, track = item.payload
         trace = all_traces[number]
-        check_track(trace, surroundings)
         weather = weathers[trace.drawn_as(number).number]
         trace_bystanders = bystanders.get(trace.path_id, ())
         script = make_track_script(trace, number, track, town, surroundings, cfg, seed, trace_bystanders, weather)

@@ -15,7 +15,7 @@ import numpy as np
 from cosfly.formats import frames
 from cosfly.formats.frames import BystandersMeta, Camera, FrameMeta, Look, TargetMeta
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M, pace_field
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, pace_field
 from cosfly.formats.people import Appearance, Goal, People
 from cosfly.formats.playback import LEGIBILITY, TARGET_FILE, Perturbation, TargetRecord, Track
 from cosfly.formats.playback_file import write_track
@@ -23,13 +23,11 @@ from cosfly.formats.traces import DroneTrace
 from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry.axes import mask_box, world_from_camera
 from cosfly.geometry.goals import SeenFrame, find_says, otherwise, target_picture, words_of
-from cosfly.geometry.kernels import signed_distances
 from cosfly.render.camera import contrast_of, legibility, rendered_visibility, view_target
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
 from cosfly.render.person import DressedBystanders, Gait
-from cosfly.render.perturbation import HIDDEN, PERTURBED, STEP_UP_M, PerturbedTrack, Poses, Surroundings
+from cosfly.render.perturbation import HIDDEN, PERTURBED, PerturbedTrack, Poses
 from cosfly.render.settings import RenderConfig
-from cosfly.runtime.errors import RenderError
 from cosfly.runtime.io import sha256_bytes, sha256_file, storage_errors, write_checksums
 from cosfly.runtime.worker import advance
 
@@ -37,7 +35,6 @@ VARIANTS = {"clean": "ORI", "perturbed": PERTURBED}
 MARGIN_M = 60.0  # shadows and sky openness are computed this far around the trajectory
 ENCODER_THREADS = 2  # of each worker, next to the drawing
 FRAMES_AHEAD = 6  # drawn but not written yet: bounds the memory (about 10 MB each)
-TOUCH_M = 0.01  # a camera this deep in a box still touches it only
 MOST_GOAL_FRAMES = 8  # the first in which the target is legible
 GOAL_LEAST_PX = 24  # a goal in words names what at least this many pixels show
 # Two appearances differ to the eye if enough pixels of the person differ in colour.
@@ -61,25 +58,6 @@ class TrackScript:
     bystanders: DressedBystanders
     look: Look | None  # None with a weather
     weather: WeatherRecord | None
-
-
-def check_track(trace: DroneTrace, surroundings: Surroundings) -> None:
-    """Check that in all frames the camera is outside every obstacle and the person not below the ground."""
-    depths_m = -signed_distances(surroundings.obstacles, trace.positions_m, 0.0)[0]
-    below_m = np.array([surroundings.below_ground_m(place) for place in trace.targets_m - [0.0, 0.0, TARGET_HEIGHT_M]])
-    fix = "plan again on this map"
-    _refuse_deep(trace, depths_m, TOUCH_M, "a camera is inside a box", expected="a camera outside all boxes", fix=fix)
-    fix = "generate the pedestrian trajectory again on this map"
-    _refuse_deep(trace, below_m, STEP_UP_M, "the target is under the ground", expected="feet on the ground", fix=fix)
-
-
-def _refuse_deep(trace: DroneTrace, depths_m: np.ndarray, limit_m: float, what: str, **advice: str) -> None:
-    """Raise RenderError with the first frame whose depth, of (n,), is above the limit."""
-    is_too_deep = depths_m > limit_m
-    if is_too_deep.any():
-        i = int(np.argmax(is_too_deep))
-        got = f"{depths_m[i]:.2f} m deep; this occurs in {np.count_nonzero(is_too_deep)} of {len(is_too_deep)} frames"
-        raise RenderError(what, where=f"{trace.path_id}: frame {i}", got=got, **advice)
 
 
 def render_track(renderer: Renderer, script: TrackScript, folder: Path, cfg: RenderConfig) -> Track:

@@ -136,16 +136,12 @@ class UnrealCvRenderer(SimulatorRenderer):
         gap_m = float(np.median(np.linalg.norm(raw / self._cfg.coord_scale - offset_m - middles_m, axis=1)))
         if gap_m <= SAME_BOX_M:
             return
-        away, away_m = (np.linalg.norm(p - np.median(p, axis=0), axis=1) for p in (raw, middles_m))
-        scale = float(np.median(away[away_m > 0] / away_m[away_m > 0])) if (away_m > 0).any() else 0.0
-        scale = scale or float("nan")  # all in one place
-        high_m = float(np.median(raw[:, 2] / scale - middles_m[:, 2]))
         raise ConfigError(
             "the map and the level differ in scale or height, so the camera would be in the wrong place",
             where=self._server.where,
             got=f"objects {gap_m:.1f} m away from their boxes with coord_scale {self._cfg.coord_scale:g} and "
             f"coord_z_offset {self._cfg.coord_z_offset:g} m",
-            expected=f"about coord_scale {scale:.4g} and coord_z_offset {high_m:.2f} m",
+            expected=f"at most {SAME_BOX_M:g} m",
             fix="set --coord-scale and --coord-z-offset, or export the map from this level",
         )
 

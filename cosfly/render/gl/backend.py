@@ -19,7 +19,7 @@ from cosfly.formats.weather import WeatherParams
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Frame, PosedPeople, PosedPerson, check_pose, far_as_sky
 from cosfly.render.gl import meshes, programs
 from cosfly.render.gl.parts import DRAW_ORDER, NEVER_PX, NUM_MATERIALS, PART, CameraView, materials_of
-from cosfly.render.gl.people import CAPSULE_M, PERSON_RADIUS_M, PersonParts, feet_of, person_parts, shadow_corners
+from cosfly.render.gl.people import CAPSULE_M, PERSON_RADIUS_M, PersonParts, person_parts, shadow_corners
 from cosfly.render.gl.programs import LooseBuffers, Programs, set_uniform
 from cosfly.render.gl.scene import build_scene
 from cosfly.render.gl.weather_pass import DEPTH_UNIT, WeatherPass, defines
@@ -310,12 +310,12 @@ class GlRenderer:
         self._depth.use(DEPTH_UNIT)
         self._tags.use(TAG_UNIT)
         for person in people.values():
-            feet = feet_of(person, self.origin_m)
-            rectangle = view.rectangle_px(shadow_corners(feet, self._sun))
+            hip = person.hip_m - self.origin_m
+            rectangle = view.rectangle_px(shadow_corners(hip, self._sun))
             if rectangle is not None:
                 x0, y0, x1, y1 = rectangle
                 self._over_color.scissor = x0, y0, x1 - x0, y1 - y0
-                set_uniform(self._programs.shadow, "feet", feet)
+                set_uniform(self._programs.shadow, "hip", hip)
                 self._shadow_triangle.render(vertices=3)
         self._over_color.scissor = None
 

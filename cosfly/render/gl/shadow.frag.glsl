@@ -7,8 +7,8 @@ uniform usampler2D tag_map;
 uniform uint person_kind;
 uniform sampler2DShadow shadow_map;
 uniform mat4 shadow_from_world;
-uniform vec3 feet;
-uniform vec3 capsule;             // lower and upper end over the feet, radius
+uniform vec3 hip;
+uniform vec3 capsule;             // lower and upper end from the hip, radius
 
 layout(location = 0) out vec4 out_color;
 
@@ -17,7 +17,7 @@ const float GROUND_ALBEDO = 0.25; // of the colour whose change the factor is
 
 // The ray from p to the sun against the capsule: 0 in its shadow, 1 beside it.
 float lets_sun(vec3 p) {
-    vec3 u = (capsule.y - capsule.x) * UP, w = p - feet - capsule.x * UP;
+    vec3 u = (capsule.y - capsule.x) * UP, w = p - hip - capsule.x * UP;
     float uu = dot(u, u), us = dot(u, sun_direction), uw = dot(u, w), sw = dot(sun_direction, w);
     float k = clamp((uw - us * sw) / max(uu - us * us, 1e-6), 0.0, 1.0);         // nearest point of the axis to the ray's line
     vec3 gap = w - k * u;
@@ -35,7 +35,7 @@ void main() {
     ivec2 pixel = ivec2(gl_FragCoord.xy);
     if ((texelFetch(tag_map, pixel, 0).r & 0xffu) == person_kind) discard;       // people darken the ground, not each other
     vec3 way = world_from_camera * vec3((gl_FragCoord.xy - lens.zw) / lens.xy, 1.0) * texelFetch(depth_map, pixel, 0).r;
-    vec3 p = camera_position + way, d = p - feet;
+    vec3 p = camera_position + way, d = p - hip;
     vec3 sun = sun_light * max(sun_direction.z, 0.0) * sun_reaches(p), sky = sky_light;
 #ifdef LIT
     sky += lamp_reach(p, UP);
