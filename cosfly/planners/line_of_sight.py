@@ -15,9 +15,10 @@ from cosfly.runtime.compiled import int64, njit
 NUM_SECTORS = 128  # equal sectors of azimuth around a target
 
 # The rays end at RAY_OFFSETS_M from the target's hip: the lowest end, and the largest shift to the side.
-LOWEST_END_M, SIDE_END_M = -0.6, 0.3
-NUM_RAYS = 5
-ALL_BLOCKED = 0b11111
+LOWEST_END_M = float(kernels.RAY_OFFSETS_M[:, 2].min())
+SIDE_END_M = float(kernels.RAY_OFFSETS_M[:, :2].max())
+NUM_RAYS = len(kernels.RAY_OFFSETS_M)
+ALL_BLOCKED = (1 << NUM_RAYS) - 1  # a bit for each ray
 NO_DISTANCE_M = 1e-6  # a nearer box counts as one around the target
 SLOPE_ROUNDING = 1e-6
 ROUNDING_M = 1e-9
@@ -80,7 +81,7 @@ def five_ray_visibility(index, horizon, target, x, y, z):
     num_free = int64(NUM_RAYS)
     for ray in range(NUM_RAYS):
         num_free -= (blocked >> ray) & 1
-    return num_free / 5.0
+    return num_free / NUM_RAYS
 
 
 @njit(cache=True)

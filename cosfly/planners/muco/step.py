@@ -3,6 +3,10 @@
 The whole search is one compiled call, because a call from Python unpacks some forty arrays, which takes a third of the
 time of an evaluation. Loops replace NumPy's whole-array forms, because each shape check takes the compiler seconds.
 Literals are passed as `int64(1)` and `boolean(False)`, so that a function is compiled for one signature only.
+
+Arguments that all functions share, for n waypoints: points: (n, 3) m. problem: loss.Problem. index: kernels.BoxIndex of
+the obstacles. state, now, spare: loss.State. nearby: nearby.Nearby, the cache of boxes. rules: Rules. masked: (n,)
+bool, waypoints in low-visibility runs.
 """
 
 from typing import NamedTuple

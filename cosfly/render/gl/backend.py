@@ -295,10 +295,9 @@ class GlRenderer:
 
     def _set_uniforms(self, values: dict[str, Any]) -> None:
         """Set the uniforms of all programs that draw the scene."""
-        compiled = self._programs
         for name, value in values.items():
             packed = programs.packed(value)
-            for program in (*compiled.materials, compiled.sky, compiled.shadow):
+            for program in (*self._programs.materials, self._programs.sky, self._programs.shadow):
                 set_uniform(program, name, packed)
 
     def _draw_shadows(self, view: CameraView, people: PosedPeople) -> None:

@@ -226,8 +226,8 @@ class CameraView:
         """Return the result of `spheres_in_view`, with this camera as its arguments."""
         middle = self.intrinsic[:2, 2]
         size = np.array([self.width_px, self.height_px])
-        # Of the angles between the optical axis and the farther border of the picture, horizontally and vertically. The
-        # kernel measures distances from the border's plane across the axis, not across the plane: 1 / cosine longer.
+        # tangents: of the angles from the optical axis to the farther border, horizontally and vertically. slants: 1 /
+        # cosine of these angles, because the kernel measures distances from a border's plane across the axis.
         tangents = np.maximum(middle, size - middle) / np.diag(self.intrinsic)[:2]
         slants = np.sqrt(1.0 + tangents**2)
         eye = self.eye.astype(np.float32)
