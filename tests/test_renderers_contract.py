@@ -22,13 +22,13 @@ import numpy as np
 import pytest
 from simulator_serving import serving
 
-from cosfly.formats import playback
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.formats.bystanders import Bystander, Bystanders, write_bystanders
-from cosfly.formats.frames import SKY_DEPTH_M, Camera, Look, read_instance, read_meta
+from cosfly.formats.frames import SKY_DEPTH_M, Camera, Look, frame_name, read_instance, read_meta
 from cosfly.formats.inspection import read_inspection
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.traces import DroneTrace, write_traces
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import box_corners, intrinsic_matrix, look_at, project, rotation_matrices, world_from_camera
@@ -476,9 +476,9 @@ def test_a_whole_flight_has_the_annotations_of_the_default_renderer(renderer_nam
     assert found == sorted(str(path.relative_to(reference)) for path in (reference / "Town_Street").rglob("*"))
     visibilities = []
     for folder in find_tracks(tree):
-        flight = playback.read_track(folder)
+        flight = read_track(folder)
         for i in range(len(flight)):
-            there = reference / folder.relative_to(tree) / playback.frame_name(i)
+            there = reference / folder.relative_to(tree) / frame_name(i)
             meta, expected = read_meta(flight.frame_folder(i)), read_meta(there)
             assert meta.target.visibility == pytest.approx(expected.target.visibility, abs=VISIBILITY_TOLERANCE)
             assert meta.target.visible == expected.target.visible
@@ -595,7 +595,7 @@ def test_a_flight_with_others_tells_of_them_in_every_frame(renderer_name, tmp_pa
     cfg = build(RenderConfig, {**DRAWN, "backend": renderer_name}, "test")
     tree = run(cfg, *inputs, tmp_path / "tree", seed=5, others=others)
     for folder in find_tracks(tree):
-        flight = playback.read_track(folder)
+        flight = read_track(folder)
         for i in range(len(flight)):
             meta, ids = read_meta(flight.frame_folder(i)), read_instance(flight.frame_folder(i))[1]
             assert [other.instance_id for other in meta.others.others] == [MAX_BOX_ID, MAX_BOX_ID - 1]
