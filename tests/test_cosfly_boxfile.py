@@ -12,7 +12,7 @@ from shapely.geometry import Polygon
 from cosfly.formats.boxes import BoxMap, write_boxes
 from cosfly.formats.kinds import KIND_NAMES
 from cosfly.maps.boxfile import BoxesConfig, load
-from cosfly.maps.footprints import CUT_SHARES, num_cuts, overlaps
+from cosfly.maps.footprints import CUT_SHARES, num_cuts
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
 from cosfly.runtime.errors import ConfigError, InputError
@@ -47,9 +47,6 @@ def test_a_table_is_read(tmp_path):
         assert_allclose(box_map.centers, [[10, 20, 4], [40, -5, 3], [25, 0, -0.15]], atol=1e-9)
         assert_allclose(box_map.half_extents, [[6, 4, 4], [2, 2, 3], [45, 3.5, 0.15]], atol=1e-9)
         assert_allclose(box_map.rotations_deg[:, 1], [30, 0, 0], atol=1e-9)
-    assert not len(overlaps(box_map))
-    box_map = loaded(tmp_path, PLAIN.replace("8,Vegetation,40,-5", "8,Vegetation,12,20"))
-    assert overlaps(box_map).tolist() == [[0, 1]]
 
 
 def collection(*features: dict, **more: object) -> str:
@@ -58,18 +55,6 @@ def collection(*features: dict, **more: object) -> str:
 
 def feature(kind: str, coordinates: list, **properties: object) -> dict:
     return {"type": "Feature", "properties": properties, "geometry": {"type": kind, "coordinates": coordinates}}
-
-
-def test_boxes_that_touch_do_not_overlap(tmp_path):
-    """The rectangles around the pieces of a bent outline share ground; those of two turned houses do not."""
-    bent = [[0, 0], [40, 0], [43, 9], [30, 12], [24, 20], [12, 31], [3, 40], [0, 22], [9, 14], [0, 0]]
-    diamonds = [[[x, 90], [x + 10, 100], [x, 110], [x - 10, 100], [x, 90]] for x in (0, 20, 40)]
-    side_by_side = [[[x, 60], [x + 10, 60], [x + 10, 70], [x, 70], [x, 60]] for x in (0, 10)]
-    crossed = [*side_by_side, [[5, 62], [14, 62], [14, 68], [5, 68], [5, 62]]]
-    kinds = {"type": "Buildings", "height_m": 9}
-    for shapes, is_found in (([*diamonds, *side_by_side], False), ([bent], True), (crossed, True)):
-        box_map = loaded(tmp_path, collection(*(feature("Polygon", [ring], **kinds) for ring in shapes)), ".geojson")
-        assert bool(len(overlaps(box_map))) == is_found
 
 
 def test_outlines_and_points_of_geojson(tmp_path):

@@ -22,7 +22,6 @@ from cosfly.runtime.io import over_limit
 
 MIN_AREA_M2 = 0.02  # smaller pieces are rounding errors of a cut
 THINNEST_M = 1e-3  # thinner rectangles are rounding errors too
-OVERLAP_M = 0.05  # boxes that share less only touch
 MOST_CROSSINGS = 500  # of an outline with itself; 1,000 take a second to resolve
 PAIRS_AT_ONCE = 1_000_000  # pairs of edges that are compared before the count is checked
 MOST_NEW_CORNERS = 50_000  # of merged outlines that cross each other
@@ -71,14 +70,6 @@ def footprints(box_map: BoxMap) -> np.ndarray:
     """Return the footprint of every upright box as a polygon, (n,)."""
     corners = box_corners(box_map.centers, box_map.half_extents, np.radians(box_map.rotations_deg[:, 1]))
     return shapely.polygons(corners[:, [0, 2, 6, 4], :2])
-
-
-def overlaps(box_map: BoxMap) -> np.ndarray:
-    """Return the pairs of boxes that share space and do not only touch, (k, 2) rows of the map, the lower first."""
-    outlines = shapely.buffer(footprints(box_map), -OVERLAP_M / 2, join_style="mitre")
-    first, second = shapely.STRtree(outlines).query(outlines, predicate="intersects")
-    shared_m = np.minimum(*box_map.maxs[[first, second], 2]) - np.maximum(*box_map.mins[[first, second], 2])
-    return np.stack([first, second], axis=1)[(first < second) & (shared_m > OVERLAP_M)]
 
 
 def rectangle_polygon(rectangle: Rectangle, along: Share = (-0.5, 0.5), across: Share = (-0.5, 0.5)) -> Polygon:

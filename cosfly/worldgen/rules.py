@@ -58,7 +58,6 @@ _SIZES = {
     "area": rf"{_NUMBER} ?(km2|km²|square kilomet(?:er|re)s?|sq\.? ?km|hectares?|ha|m2|m²|square met(?:er|re)s)(?!\w)",
     "length": rf"{_NUMBER} ?{_LENGTH} long\b",  # "800 m long"
 }
-_STREETS = r"\b(\d+) ([a-z-]+ )?(avenue|boulevard|spoke|street|road)s?\b"  # "6 broad avenues"
 _ABSENT = r"\b(?:no|without(?: any)?)\s+((?:(?! (?:but|and|with) )[^.,;:()])+)"  # "without any towers"
 _STOPS = "|".join(_longest_first(STOPS))
 
@@ -172,7 +171,6 @@ class _Reader:
         self.sizes = {name: match for name, pattern in _SIZES.items() if (match := self._take(pattern))}
         while match := self._take(rf"{_NUMBER} ?{_LENGTH}[- ]wide\b"):  # before the word "wide"
             self.not_used.append(match[0].strip())
-        self.streets = self._take(_STREETS, keep=r", \2 \3 ,")
         self.heights = {name: match for name, pattern in _HEIGHTS.items() if (match := self._take(pattern))}
         for name in [name for name in self.heights if name != "at_least"][1:]:  # highest ones after the first
             self.not_used.append(self.heights.pop(name)[0].strip())
@@ -334,8 +332,6 @@ class _Reader:
             most_m = min(self.plan["size_m"]) / 4  # so that blocks remain
             self.plan["river_m"] = min(self.plan["river_m"], most_m / 2)
             self.plan |= {field: min(self.plan[field], most_m) for field in ("street_m", "avenue_m")}
-        if self.streets and self.streets[1] != "1":  # no pattern has a number of streets
-            self.not_used.append(f"{self.streets[1]} {self.streets[3]}s")
 
     def _within(self, what: str, value: Any, low: Any, high: Any) -> Any:
         """Return a value within what is possible; record one that is not."""

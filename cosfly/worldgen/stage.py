@@ -11,15 +11,12 @@ import numpy as np
 import shapely
 import yaml
 from pydantic import Field
-from scipy.ndimage import binary_erosion
 
-from cosfly.formats.boxes import OUR_LICENCE, BoxMap
-from cosfly.formats.kinds import KINDS
-from cosfly.geometry.grid import connected_parts, empty_grid, occupancy, surface
+from cosfly.formats.boxes import OUR_LICENCE
 from cosfly.llm.answers import AnswerBook, KeptAnswers
 from cosfly.llm.client import ChatClient, EndpointConfig
 from cosfly.llm.contract import NoAnswer, Reply, started
-from cosfly.maps.footprints import footprints, overlaps
+from cosfly.maps.footprints import footprints
 from cosfly.maps.simworld import PLACEHOLDER_CM
 from cosfly.runtime.config import Config, read_yaml, shipped
 from cosfly.runtime.errors import InputError, TeacherError
@@ -39,9 +36,7 @@ CHECKS_FORMAT = FileFormat("cosfly.world_checks", "1.0", "checks of a world")
 CREDITS = "cosfly; sizes of assets by SimWorld, maitrix-org and contributors"
 MOST_CHARACTERS = 2000  # of a prompt
 
-AT_THE_DOOR_M = 2.0  # from a building to the pavement that leads to it
 ROAD_COST = 20  # a metre of carriageway away from crossings costs as much as 20 m of pavement
-WALK_M = 100.0  # the longest pedestrian trajectory that must fit: app:simworld:step4 samples 50 to 100 m
 
 
 class WorldConfig(Config):
@@ -59,17 +54,10 @@ def check_world(town: Town, plan: WorldPlan) -> list[dict[str, Any]]:
     """Return each check of a world: its name, the measured value, the accepted range, and whether it is met."""
     world = town.boxes
     houses, buildings = (one.select(of_kinds(one, "Buildings")) for one in (town.layout, world))
-    joined = shapely.union_all(shapely.buffer(footprints(buildings), 0.02, join_style="mitre"))
-    num_parts = len(shapely.get_parts(joined))
-    num_reached, component_m, component_share = _reach(world, shapely.get_parts(joined))
     kinds = plan.kinds_of_buildings()
     low, high = min(kind.heights_m[0] for kind in kinds), max(kind.heights_m[1] for kind in kinds)
     heights_m = houses.maxs[:, 2] if len(houses) else [low]
     checks = [
-        ("overlapping buildings", len(overlaps(buildings)), 0, 0),
-        ("buildings without a pavement", num_parts - num_reached, 0, 0),
-        ("length of the largest walkable component, m", component_m, WALK_M, 1e5),
-        ("walkable ground in it", component_share, 0.8, 1.0),
         ("building share", shapely.area(footprints(houses)).sum() / town.land_m2, *plan.building_share),
         ("lowest building, m", min(heights_m), low, high),
         ("highest building, m", max(heights_m), low, high),
@@ -104,24 +92,6 @@ def _problems(checks: list[dict[str, Any]], town: Town, trace: dict[str, Any]) -
     if not trace.get("settlement_is_named", True):
         parts.insert(0, f"no kind of place that the generator has is named, so this is a {trace['settlement']}")
     return "; ".join(parts)
-
-
-def _reach(box_map: BoxMap, buildings: np.ndarray) -> tuple[int, float, float]:
-    """Return how many buildings the largest walkable component reaches, its length, and its share of all components.
-
-    Walkable is pavement and road without an obstacle, on the grid of the pedestrian stage.
-    """
-    grid = empty_grid(box_map)
-    paved = surface(box_map, {KINDS["Sidewalks"], KINDS["Roads"]}, like=grid)
-    assert paved is not None, "every town has streets"
-    labels, sizes = connected_parts(paved & ~occupancy(box_map, like=grid).occupied, 8)
-    if len(sizes) < 2:
-        return 0, 0.0, 0.0
-    largest = labels == np.argmax(sizes)
-    cells = np.argwhere(largest & ~binary_erosion(largest))[:, ::-1]  # its edge
-    near = shapely.STRtree(shapely.points(grid.centers_of(cells))).query(buildings, "dwithin", AT_THE_DOOR_M)
-    length_m = grid.resolution_m * float(np.hypot(*(np.ptp(cells, axis=0) + 1)))
-    return len(np.unique(near[0])), length_m, sizes.max() / sizes.sum()
 
 
 TASK = """You plan a town for a generator that lays out streets, blocks and buildings. The user describes the town.
