@@ -5,6 +5,7 @@ again.
 """
 
 import asyncio
+import logging
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -24,6 +25,8 @@ from cosfly.llm.contract import NoAnswer, Reply, Request, run_until_interrupted
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError, TeacherError
 from cosfly.runtime.escaping import LONGEST_LOG, for_terminal
 from cosfly.runtime.run_dir import Resume
+
+log = logging.getLogger(__name__)
 
 
 def show_windows(
@@ -50,12 +53,16 @@ def show_windows(
     windows = [w for track in dict.fromkeys(chosen) for w in islice(track.windows(cfg), chosen.count(track))]
     exchanges: dict[str, list[tuple[Request, Reply]]] = {window.observed.sample_id: [] for window in windows}
 
+    def record(sample_id: str, request: Request, reply: Reply) -> None:
+        exchanges[sample_id].append((request, reply))
+        log.info("%s: answer %d", sample_id, len(exchanges[sample_id]))
+
     async def ask() -> list[Caption | BaseException]:
         with AnswerBook(out / ANSWERS) as book:
             budget = Budget(cfg.budget, cfg.most_in_flight, book.totals)
             async with open_teacher(cfg, book, seed, budget) as teacher:
                 assert isinstance(teacher, AskingTeacher)
-                teacher.kept.listener = lambda sample_id, *exchange: exchanges[sample_id].append(exchange)
+                teacher.kept.listener = record
                 asked = [caption_window(window, teacher, cfg, vocabulary) for window in windows]
                 return await asyncio.gather(*asked, return_exceptions=True)
 

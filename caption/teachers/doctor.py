@@ -192,8 +192,10 @@ class _Examination:
         if isinstance(reply, str):
             is_slow = seconds >= self.cfg.endpoint.timeout_s
             if is_slow and self.tokens_per_s:
-                reply += f". At {self.tokens_per_s:.1f} tokens/s, as in the first answer, {limit} tokens "
+                reply += f". At {self.tokens_per_s:.1f} tokens/s, as in the short first answer, {limit} tokens "
                 reply += f"(caption.endpoint.max_tokens) take {limit / self.tokens_per_s:.0f} s"
+            if is_slow and self.cfg.endpoint.json_schema:
+                reply += ". Some servers are slow with a JSON schema: try caption.endpoint.json_schema=false"
             self._add(
                 "speed" if is_slow else "context length", "unusable", f"the largest prompt gets no answer: {reply}"
             )
@@ -212,9 +214,8 @@ class _Examination:
         detail = f"{seconds:.1f} s for one answer to the largest prompt"
         if queued_s > endpoint.timeout_s:
             detail += (
-                f"; a server with one slot needs {queued_s:.0f} s for caption.endpoint.concurrency={endpoint.concurrency} "
-                f"requests, more than caption.endpoint.timeout_s={endpoint.timeout_s:g}, so a run begins with two requests and "
-                "sends more only while answers are quick"
+                "; a run begins with two requests at once and sends more only while answers are quick, since a server with "
+                f"one slot would need {queued_s:.0f} s for caption.endpoint.concurrency={endpoint.concurrency} requests"
             )
         self._add("speed", "ok", detail)
 

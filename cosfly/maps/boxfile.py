@@ -213,7 +213,7 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
     for note, places in notes.items():
         log.warning("%s: %s", path.name, listed(places, note))
     if sources["levels"] or sources["default"]:
-        log.warning("%s: sources of the sizes of boxes: %s", path.name, counts_text(sources))
+        log.warning("%s: the sizes of boxes come from: %s", path.name, counts_text(sources))
     header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows))
     update: dict[str, Any] = {"dropped_objects": dict(dropped.counts)} if dropped.counts else {}
     if set(sources) != {"file"}:

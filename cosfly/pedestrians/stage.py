@@ -210,7 +210,10 @@ def run(
             summary["others"] = _write_bystanders(outputs[-1], [result.bystanders for result in results], header, cfg)
         write_json(out / "pedestrians_report.json", summary)
         share = summary["total"]["on_carriageway_share"]
-        log.info("%.1f %% of the points are on carriageway away from crossings (see road_cost)", 100 * share)
+        log.info(
+            "%.1f %% of the points are on carriageway away from crossings (pedestrians.road_cost above 1 lowers it)",
+            100 * share,
+        )
         write_bytes(out / "paths.png", draw_overview(ground, paths))
     rounded = {step: round(value, 4) for step, value in seconds.items()}
     stage.finish(outputs, finished.tally, ground=ground.counts, total=summary["total"], seconds_by_step=rounded)
