@@ -25,7 +25,7 @@ from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Manifest, Tally, read_manifest
 from cosfly.runtime.worker import Item
 from cosfly.studies.depth import study_of
-from cosfly.studies.zoom import enlarged_fov_deg, tree_of
+from cosfly.studies.zoom import enlarged_fov_deg
 from release.card.tables import all_tables
 from release.record import read_record
 
@@ -66,11 +66,9 @@ def test_a_longer_lens_shows_the_middle_as_large():
 @needs_gl
 def test_the_target_grows_as_the_lens_does(tmp_path_factory, in_this_process):
     folder = tmp_path_factory.mktemp("study")
-    in_the_wall = circling(4, "path_001")
-    in_the_wall.positions_m[2] = (-6.0, -16.0, 0.5)
-    boxes, simplified, traces = write_inputs(folder / "inputs", [circling(6), circling(5, "path_002"), in_the_wall])
+    boxes, simplified, traces = write_inputs(folder / "inputs", [circling(6), circling(5, "path_002")])
     words = f"study zoom --map {boxes} --simplified {simplified} --traces {traces} --out {folder / 'out'} --every 2"
-    settings = f"max_failed=1 render.fovs_deg={LEVELS} render.width_px=640 render.height_px=360".replace(", ", ",")
+    settings = f"render.fovs_deg={LEVELS} render.width_px=640 render.height_px=360".replace(", ", ",")
     sets = [word for setting in settings.split() for word in ("--set", setting)]
     result = invoke(words, "--workers 0", sets)
     assert result.exit_code == 0, result.output
@@ -86,8 +84,6 @@ def test_the_target_grows_as_the_lens_does(tmp_path_factory, in_this_process):
     assert long["visibility"]["mean"] == pytest.approx(wide["visibility"]["mean"], abs=0.05)
     assert 0.2 < long["track_quality"]["mean"] < 1.0
     assert set(wide["by_flight"]) == {"path_000", "path_002"}
-    counts = read_manifest(tree_of(out, LEVELS[0])).counts  # a bad flight is counted and stops no other
-    assert (counts.input, counts.kept, dict(counts.failed)) == (3, 2, {"render": 1})
 
 
 def event(at_s: float, kind: str, **fields) -> Event:
