@@ -190,15 +190,7 @@ class _Examination:
         reply = await self._ask(self.largest, limit, answer_schema(more=THEREFORE))
         seconds = time.monotonic() - start_s
         if isinstance(reply, str):
-            is_slow = seconds >= self.cfg.endpoint.timeout_s
-            if is_slow and self.tokens_per_s:
-                reply += f". At {self.tokens_per_s:.1f} tokens/s, as in the short first answer, {limit} tokens "
-                reply += f"(caption.endpoint.max_tokens) take {limit / self.tokens_per_s:.0f} s"
-            if is_slow and self.cfg.endpoint.json_schema:
-                reply += ". Some servers are slow with a JSON schema: try caption.endpoint.json_schema=false"
-            self._add(
-                "speed" if is_slow else "context length", "unusable", f"the largest prompt gets no answer: {reply}"
-            )
+            self._report_no_answer(reply, is_slow=seconds >= self.cfg.endpoint.timeout_s)
             return
         used, known = _prompt_tokens(reply), f" of the context of {context}" if context else ""
         detail = f"{used or 'unknown'} tokens of the largest prompt and {limit} for the answer"
@@ -209,6 +201,20 @@ class _Examination:
             self._add("context length", "unusable", f"{cut} without an error; {MEANINGS['too_long'].fix}")
         else:
             self._add("context length", "ok", f"{detail}{known}")
+        self._report_speed(seconds)
+
+    def _report_no_answer(self, problem: str, *, is_slow: bool) -> None:
+        """Report that the largest prompt gets no answer, and what helps a slow server."""
+        limit = self.cfg.endpoint.max_tokens
+        if is_slow and self.tokens_per_s:
+            problem += f". At {self.tokens_per_s:.1f} tokens/s, as in the short first answer, {limit} tokens "
+            problem += f"(caption.endpoint.max_tokens) take {limit / self.tokens_per_s:.0f} s"
+        if is_slow and self.cfg.endpoint.json_schema:
+            problem += ". Some servers are slow with a JSON schema: try caption.endpoint.json_schema=false"
+        self._add("speed" if is_slow else "context length", "unusable", f"the largest prompt gets no answer: {problem}")
+
+    def _report_speed(self, seconds: float) -> None:
+        """Report the time of the answer to the largest prompt."""
         endpoint = self.cfg.endpoint
         queued_s = endpoint.concurrency * seconds
         detail = f"{seconds:.1f} s for one answer to the largest prompt"
@@ -220,11 +226,13 @@ class _Examination:
         self._add("speed", "ok", detail)
 
     async def _cuts_prompts(self, used: int | None) -> bool:
-        """Return whether a longer prompt counts no more tokens than the largest one."""
+        """Return whether a longer prompt counts no more tokens than the largest one; False if they are not counted."""
+        if used is None:
+            return False
         system, question, *correction = self.largest
         padded = question | {"content": [*question["content"], {"type": "text", "text": PADDING}]}
         num_tokens = _prompt_tokens(await self._ask([system, padded, *correction], MIN_TOKENS))
-        return used is not None and num_tokens is not None and num_tokens <= used
+        return num_tokens is not None and num_tokens <= used
 
 
 def _prompt_tokens(reply: Reply | str) -> int | None:

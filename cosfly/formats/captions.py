@@ -323,3 +323,12 @@ def read_captions(path: Path) -> Iterator[Caption]:
 def caption_lines(path: Path) -> Iterator[tuple[str, Caption]]:
     """Yield each line of `captions.jsonl`, its end included, and its caption."""
     return model_lines(path, Caption, what="captions", fix="run cosfly caption first")
+
+
+def caption_spans(path: Path) -> Iterator[tuple[tuple[int, int], Caption]]:
+    """Yield where each line of `captions.jsonl` is stored, its first byte and its size, and its caption."""
+    begin = 0
+    for line, caption in caption_lines(path):
+        size = len(line.encode())
+        yield (begin, size), caption
+        begin += size

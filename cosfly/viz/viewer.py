@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cosfly.formats.boxes import BoxMap, read_boxes
-from cosfly.formats.captions import FIELDS, Caption, ValueCounts, caption_lines
+from cosfly.formats.captions import FIELDS, Caption, ValueCounts, caption_spans
 from cosfly.formats.frames import frame_path
 from cosfly.formats.inspection import read_settled
 from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES
@@ -130,31 +130,33 @@ def _find_trees(folder: Path, captions: Path | None) -> list[Tree]:
 
 
 def _find_tracks(trees: list[Tree], most: int) -> tuple[dict[Place, _Shown], list[str]]:
-    """Return the tracks to show, and a note if there are others: whole trajectories, evenly spread, as many as fit and
-    one at least."""
+    """Return the tracks to show with their captions and results, and a note if there are others."""
     found = {tree.place(place_of(path)): (path, tree.captions) for tree in trees for path in find_tracks(tree.data)}
-    groups: dict[Group, list[Place]] = defaultdict(list)
-    for place in found:
-        groups[place.run, place.town, place.trajectory].append(place)
-    members, chosen = list(groups.values()), list(found)
-    for count in range(len(members), 0, -1):
-        chosen = [place for k in spread(len(members), count) for place in members[k]]
-        if len(chosen) <= most:
-            break
-    tracks = {place: _Shown(*found[place]) for place in chosen}
+    tracks = {place: _Shown(*found[place]) for place in _choose_tracks(list(found), most)}
     for tree in trees:
-        begin = 0
-        for line, caption in caption_lines(tree.captions) if tree.captions else ():
-            size, shown = len(line.encode()), tracks.get(tree.place(caption))
-            if shown is not None:
+        for span, caption in caption_spans(tree.captions) if tree.captions else ():
+            if (shown := tracks.get(tree.place(caption))) is not None:
                 decision = caption.en.flight_decision if caption.en else None
                 shown.kinds[caption.frame_index] = caption.status, caption.verdict, decision
-                shown.spans[caption.frame_index] = begin, size
-            begin += size
-        for one in read_settled(tree.inspect).flights if tree.inspect else ():
-            if (shown := tracks.get(tree.place(one))) is not None:
-                shown.result = one.result
+                shown.spans[caption.frame_index] = span
+        for inspected in read_settled(tree.inspect).flights if tree.inspect else ():
+            if (shown := tracks.get(tree.place(inspected))) is not None:
+                shown.result = inspected.result
     return tracks, [f"{len(tracks):,} of {len(found):,} tracks are shown"] if len(tracks) < len(found) else []
+
+
+def _choose_tracks(places: list[Place], most: int) -> list[Place]:
+    """Return the tracks of whole trajectories, evenly spread: as many as fit, and one trajectory at least."""
+    groups: dict[Group, list[Place]] = defaultdict(list)
+    for place in places:
+        groups[place.run, place.town, place.trajectory].append(place)
+    trajectories = list(groups.values())
+    chosen = places
+    for count in range(len(trajectories), 0, -1):
+        chosen = [place for k in spread(len(trajectories), count) for place in trajectories[k]]
+        if len(chosen) <= most:
+            break
+    return chosen
 
 
 def choose_frames(frames: Sequence[int], kinds: Mapping[int, Hashable], most: int) -> list[int]:

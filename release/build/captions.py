@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from cosfly.formats.captions import Caption, caption_lines
+from cosfly.formats.captions import Caption, caption_spans
 from cosfly.formats.places import sample_id
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import read_bytes
@@ -95,15 +95,12 @@ def index_captions(
     Raises:
         InputError: A caption is of another tree, lacks a language, or repeats a frame.
     """
-    first = 0
-    for line, caption in caption_lines(path):
-        begin, size = first, len(line.encode())
-        first += size
+    for span, caption in caption_spans(path):
         key = (caption.town, caption.trajectory, caption.variant)
         try:
             _check(caption, is_known=key in released or key in others)
             if key in released:
-                released[key].add(caption, (begin, size))
+                released[key].add(caption, span)
         except InputError as error:
             error.where = f"{path}: {caption.sample_id}"
             raise
