@@ -97,33 +97,38 @@ async def started(engine: Engine) -> AsyncIterator[None]:
 
 
 def run_until_interrupted(main: Coroutine[Any, Any, Result]) -> Result:
-    """Run a coroutine as `asyncio.run` does, and let SIGTERM cancel its tasks in order, as Ctrl-C does.
+    """Run a coroutine as `asyncio.run` does, and let Ctrl-C and SIGTERM cancel its tasks in order.
 
-    It then raises SystemExit, as the command line does. Otherwise each cancelled task would print a traceback. Journals
-    survive an end at any time.
+    When all tasks have ended, it raises KeyboardInterrupt, or SystemExit as the command line does. Otherwise each
+    cancelled task would print a traceback. Journals survive an end at any time.
     """
     if threading.current_thread() is not threading.main_thread():
         return asyncio.run(main)
-    is_terminated = False
-    previous = signal.getsignal(signal.SIGTERM)
+    received: signal.Signals | None = None
+    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     async def guarded() -> Result:
         task = asyncio.current_task()
         assert task is not None
 
-        def terminate() -> None:
-            nonlocal is_terminated
-            is_terminated = True
+        def interrupt(number: signal.Signals) -> None:
+            nonlocal received
+            received = number
             task.cancel()
 
-        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, terminate)
+        for number in previous:
+            asyncio.get_running_loop().add_signal_handler(number, interrupt, number)
         return await main
 
     try:
-        return asyncio.run(guarded())
+        result = asyncio.run(guarded())
     except asyncio.CancelledError:
-        if is_terminated:
-            raise SystemExit(128 + signal.SIGTERM) from None
-        raise
+        if received is None:
+            raise
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+    if received is None:
+        return result
+    # A signal may also come after the end of all tasks, while the loop waits for its threads.
+    raise KeyboardInterrupt if received == signal.SIGINT else SystemExit(128 + received)
