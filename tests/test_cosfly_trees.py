@@ -152,6 +152,14 @@ def test_a_quirk_is_read_and_survives_writing(foreign, tmp_path, subtests):
                 _check_quirk(folder, name, change)
 
 
+def test_false_is_no_place(foreign, tmp_path):
+    """Public files write false for an offset that is zero; a target's place is unknown then, not the origin."""
+    folder = tmp_path / "Town01/trajectory_1777083733/ORI"
+    shutil.copytree(foreign / folder.relative_to(tmp_path), folder)
+    change_json(folder / "trajectory.json", each(lambda p: p.update(target={"world_location": False, "depth": 3.0})))
+    assert np.isnan(read_track(folder).targets_m).all()
+
+
 def _check_quirk(folder: Path, name: str, change: Callable[[dict], object]) -> None:
     change_json(folder / "trajectory.json", change)
     flight = read_track(folder)

@@ -53,13 +53,16 @@ def _number_or_nan(value: Any) -> float:
 
 
 def _vector(names: tuple[str, ...], value: Any) -> list[float]:
-    """Return the numbers of {"x": .., "y": ..} or [.., ..], zeros for the flag false, and NaN for anything else."""
-    if value is False:
-        return [0.0] * len(names)
+    """Return the numbers of {"x": .., "y": ..} or [.., ..], and NaN for anything else."""
     parts = [value.get(name) for name in names] if isinstance(value, dict) else value
     if isinstance(parts, list) and len(parts) == len(names) and all(map(is_number, parts)):
         return parts
     return [np.nan] * len(names)
+
+
+def _offset(names: tuple[str, ...], value: Any) -> list[float]:
+    """Return the numbers of an offset; zeros for the flag false, with which public files say that there is none."""
+    return [0.0] * len(names) if value is False else _vector(names, value)
 
 
 def _at(*paths: str, default: Any = None) -> Any:
@@ -72,7 +75,8 @@ Number = Annotated[float, Field(strict=True, ge=-LARGEST, le=LARGEST)]
 NumberOrNan = Annotated[float, PlainValidator(_number_or_nan)]
 Flag = Annotated[bool, PlainValidator(bool)]
 Position = Annotated[list[float], PlainValidator(partial(_vector, XYZ))]
-Angles = Annotated[list[float], PlainValidator(partial(_vector, ANGLES))]
+Offset = Annotated[list[float], PlainValidator(partial(_offset, XYZ))]
+AngleOffset = Annotated[list[float], PlainValidator(partial(_offset, ANGLES))]
 Box = Annotated[list[float], PlainValidator(partial(_vector, BBOX))]
 Pixel = Annotated[list[float], PlainValidator(partial(_vector, UV))]
 
@@ -101,9 +105,9 @@ class _Point(BaseModel):
     waypoint: Any = _at("nav_waypoint.t1_world", default="missing")
     intrinsic: Any = _at("camera.intrinsic")
     is_perturbed: Any = None
-    drone_offset: Position = _at("perturbation.offsets.drone_position", "perturbation.drone_position")
-    rotation_offset: Angles = _at("perturbation.offsets.drone_rotation", "perturbation.drone_rotation")
-    target_offset: Position = _at("perturbation.offsets.target_position", "perturbation.target_position")
+    drone_offset: Offset = _at("perturbation.offsets.drone_position", "perturbation.drone_position")
+    rotation_offset: AngleOffset = _at("perturbation.offsets.drone_rotation", "perturbation.drone_rotation")
+    target_offset: Offset = _at("perturbation.offsets.target_position", "perturbation.target_position")
     target: Any = "missing"
     world_location: Position = _at("target.world_location")
     in_view: Flag = _at("target.in_view", "target.visible")
