@@ -491,4 +491,4 @@ def test_a_fix_names_the_settings_of_its_client():
     fixes = [
         ChatClient("http://h", cfg).fix_of(MEANINGS["too_long"]) for cfg in (EndpointConfig(), StudentEndpointConfig())
     ]
-    assert ["caption.endpoint.max_tokens" in fixes[0], "distill.infer.endpoint.max_tokens" in fixes[1]] == [True, True]
+    assert ["caption.endpoint.max_tokens" in fixes[0], "distill.infer.max_new_tokens" in fixes[1]] == [True, True]

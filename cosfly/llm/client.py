@@ -51,7 +51,7 @@ _tls = functools.cache(httpx.create_ssl_context)  # certificates are read once: 
 
 
 class EndpointConfig(Config):
-    section: ClassVar[str] = "caption.endpoint"  # where a user finds these settings, for messages
+    own_names: ClassVar[dict[str, str]] = {}  # settings of teachers in messages -> what they are called here
     model: str | None = Field(None, description="name of the model; empty: the endpoint's only model")
     temperature: float = Field(0.6, ge=0, le=2, description="sampling temperature; 0 is greedy")
     top_p: ClassVar[float] = 0.95  # nucleus sampling; extra_body may set another
@@ -214,7 +214,7 @@ class ChatClient:
         num_at_once = int(self.concurrency.limit)
         if not is_quick and num_at_once < self.cfg.concurrency:
             limit = f"at most {num_at_once} requests are sent at once until answers take less than a third of "
-            limit += f"{self.cfg.section}.timeout_s; raise it if the server can answer more requests at once"
+            limit += self._named("caption.endpoint.timeout_s; raise it if the server can answer more requests at once")
             self._tell_once("slow", logging.INFO, f"an answer took {seconds:.0f} s, so {limit}")
         self._watch_prompts(reply, request)
         return self._with_full_context(reply, request)
@@ -353,7 +353,12 @@ class ChatClient:
 
     def fix_of(self, meaning: Meaning) -> str:
         """Return the fix of a refusal, with the names of the settings of this client."""
-        return meaning.fix.replace(EndpointConfig.section, self.cfg.section)
+        return self._named(meaning.fix)
+
+    def _named(self, text: str) -> str:
+        for name, own_name in self.cfg.own_names.items():
+            text = text.replace(name, own_name)
+        return text
 
     def _error(self, what: str, **parts: Any) -> TeacherError:
         return TeacherError(what, where=self.where, **parts)
@@ -361,7 +366,9 @@ class ChatClient:
     def message_of(self, error: Exception) -> str:
         """Return the message of an exchange that failed."""
         if isinstance(error, TimeoutError | httpx.TimeoutException):
-            fix = f"raise the limit, such as {self.cfg.section}.timeout_s={2 * self.cfg.timeout_s:g}, or use a"
+            fix = self._named(
+                f"raise the limit, such as caption.endpoint.timeout_s={2 * self.cfg.timeout_s:g}, or use a"
+            )
             return f"no answer within {self.cfg.timeout_s:g} s; {fix} faster server, a smaller model or shorter prompts"
         return self._clean(f"{type(error).__name__} {error}")
 

@@ -4,6 +4,7 @@ An engine knows no captions, journals or budgets: it is started, answers many re
 """
 
 import asyncio
+import os
 import signal
 import threading
 from collections.abc import AsyncIterator, Coroutine
@@ -15,6 +16,7 @@ from cosfly.formats.captions import Usage
 
 Result = TypeVar("Result")
 CountName = Literal["prompt_tokens", "completion_tokens"]
+AT_ONCE = b"error: interrupted at once; recorded answers are kept; run the same command again to continue\n"
 MOST_TOKENS = 10_000_000  # of one answer: longer than the context of any model
 STOP_AFTER_FAILURES = 20  # consecutive windows or samples without an answer after which a run ends
 
@@ -97,7 +99,7 @@ async def started(engine: Engine) -> AsyncIterator[None]:
 
 
 def run_until_interrupted(main: Coroutine[Any, Any, Result]) -> Result:
-    """Run a coroutine as `asyncio.run` does, and let Ctrl-C and SIGTERM cancel its tasks in order.
+    """Run a coroutine as `asyncio.run` does: Ctrl-C or SIGTERM cancels its tasks in order, a second ends the process.
 
     When all tasks have ended, it raises KeyboardInterrupt, or SystemExit as the command line does. Otherwise each
     cancelled task would print a traceback. Journals survive an end at any time.
@@ -113,6 +115,9 @@ def run_until_interrupted(main: Coroutine[Any, Any, Result]) -> Result:
 
         def interrupt(number: signal.Signals) -> None:
             nonlocal received
+            if received is not None:
+                os.write(2, AT_ONCE)
+                os._exit(128 + number)
             received = number
             task.cancel()
 

@@ -26,7 +26,11 @@ MAX_ANSWER_TOKENS = 512  # 1.5 times the longest answer in training
 class StudentEndpointConfig(EndpointConfig):
     """Sampling of a student: greedy and without thinking, as in training."""
 
-    section: ClassVar[str] = "distill.infer.endpoint"
+    own_names: ClassVar[dict[str, str]] = {
+        "caption.endpoint.max_tokens": "distill.infer.max_new_tokens",
+        "caption.endpoint": "distill.infer.endpoint",
+        "caption.image.max_side_px": "distill.infer.max_pixels",
+    }
     temperature: ClassVar[float] = 0.0  # type: ignore[misc]
     top_p: ClassVar[float] = 1.0
     max_tokens: ClassVar[int] = MAX_ANSWER_TOKENS  # type: ignore[misc]
