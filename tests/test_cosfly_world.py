@@ -155,7 +155,9 @@ def test_what_is_not_respected_is_named_in_the_report_and_in_one_line(tmp_path, 
     assert checks["not_respected"] == ["size of the town, m: 50 is said, 80 is possible"]
     assert [one["is_met"] for one in checks["checks"] if one["check"] == "number of houses"] == [False]
     (line,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert all(name in line for name in ("streets 2 m wide, airport, control tower", "size of the town", "number of houses"))
+    assert all(
+        name in line for name in ("streets 2 m wide, airport, control tower", "size of the town", "number of houses")
+    )
     assert plan_by_rules(prompt, 0)[0].heights_m[1] < 20.0  # a control tower makes no city of towers
 
 
