@@ -174,6 +174,8 @@ class _Gltf:
         accessor = self.accessors[accessor_number]
         if "bufferView" not in accessor or "sparse" in accessor:
             raise ValueError("a sparse accessor is not supported")
+        if accessor["type"] != {1: "SCALAR", 3: "VEC3"}[num_columns]:
+            raise ValueError(f"an accessor of type {accessor['type']} is used for {num_columns} columns")
         view, dtype = self.views[accessor["bufferView"]], np.dtype(DTYPES[accessor["componentType"]])
         start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         strides = (view.get("byteStride") or num_columns * dtype.itemsize, dtype.itemsize)

@@ -13,9 +13,9 @@ uniform vec3 capsule;             // lower and upper end from the hip, radius
 layout(location = 0) out vec4 out_color;
 
 const vec3 UP = vec3(0.0, 0.0, 1.0);
-const float GROUND_ALBEDO = 0.25; // of the colour whose change the factor is
+const float GROUND_ALBEDO = 0.25; // the factor is the change of this colour
 
-// The ray from p to the sun against the capsule: 0 in its shadow, 1 beside it.
+// The ray from p to the sun against the capsule: 0 in its shadow, 1 outside.
 float lets_sun(vec3 p) {
     vec3 u = (capsule.y - capsule.x) * UP, w = p - hip - capsule.x * UP;
     float uu = dot(u, u), us = dot(u, sun_direction), uw = dot(u, w), sw = dot(sun_direction, w);
