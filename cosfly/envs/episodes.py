@@ -95,7 +95,14 @@ def read_list(name: str) -> tuple[str, tuple[tuple[str, int], ...], str]:
         if env not in lists:
             problem = f"there is no environment of this name{nearest(name, lists)}"
         raise InputError(problem, where="--env", got=name, expected=f"one of {', '.join(lists.get(env, lists))}")
-    task = [env, [[HELD_OUT[town]._asdict(), number] for town, number in episodes], SIZE_PX, FOV_DEG, NUM_DECISIONS]
+    task = [
+        env,
+        TASKS[env].recorded(),
+        [[HELD_OUT[town]._asdict(), number] for town, number in episodes],
+        SIZE_PX,
+        FOV_DEG,
+        NUM_DECISIONS,
+    ]
     return env, episodes, sha256_bytes(dump_json(task).encode())
 
 
