@@ -13,6 +13,7 @@ import re
 import time
 from collections import Counter
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, BinaryIO
@@ -33,6 +34,7 @@ from cosfly.llm.contract import Reply, Request
 from cosfly.llm.protocol import MEANINGS
 from cosfly.llm.student_chat import StudentEndpointConfig
 from cosfly.runtime.errors import NothingKept, TeacherError
+from distill.inference.samples import InferConfig
 from specimens import make_playback_tree
 
 TRIES = 2
@@ -487,8 +489,13 @@ def test_the_command_exits_with_1_when_unusable():
         assert invoke("caption doctor", server.url).exit_code == 1
 
 
-def test_a_fix_names_the_settings_of_its_client():
-    fixes = [
-        ChatClient("http://h", cfg).fix_of(MEANINGS["too_long"]) for cfg in (EndpointConfig(), StudentEndpointConfig())
-    ]
-    assert ["caption.endpoint.max_tokens" in fixes[0], "distill.infer.max_new_tokens" in fixes[1]] == [True, True]
+def test_a_fix_names_settings_of_its_client():
+    sections = {"caption": CaptionConfig(), "distill.infer": InferConfig()}
+    for cfg, own in ((EndpointConfig(), "caption"), (StudentEndpointConfig(), "distill.infer")):
+        client = ChatClient("http://h", cfg)
+        for meaning in MEANINGS.values():
+            named = re.findall(r"\b((?:caption|distill\.infer)(?:\.[a-z_]+)+)", client.fix_of(meaning))
+            assert {name.startswith(own) for name in named} <= {True}, named
+            for name in named:
+                attrgetter(name.removeprefix(f"{own}."))(sections[own])
+        assert f"{own}.endpoint.timeout_s" in client.message_of(TimeoutError())

@@ -303,10 +303,12 @@ def test_it_also_counts_while_threads_are_waited_for():
     assert interrupted("thread") == (7, ["asking", "ended"], "")
 
 
-def test_a_second_one_ends_what_hangs():
-    status, printed, errors = interrupted("hang")
-    assert (status, printed) == (130, ["asking", "ending"])
-    assert errors.startswith("error: interrupted at once; recorded answers are kept")
+def test_twice_ends_the_process_in_one_line():
+    status, said, complained = interrupted("hang")
+    assert (status, said) == (130, ["asking", "ending"])
+    assert (
+        complained == "error: interrupted at once; recorded answers are kept; run the same command again to continue\n"
+    )
 
 
 def test_a_request_to_terminate_ends_everything_in_order():

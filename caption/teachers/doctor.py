@@ -66,7 +66,7 @@ def examine_endpoint(
     with progress_bar("doctor", NUM_REQUESTS - 2 * (not cfg.num_images) - (not cfg.endpoint.json_schema)) as advance:
         largest = largest_messages(cfg, vocabulary)
         examination = _Examination(ChatClient(url, cfg.endpoint), cfg, largest, advance, most_requests)
-        return run_until_interrupted(examination.run())
+        return run_until_interrupted(examination.run(), keeps_work=False)
 
 
 class _LimitReached(Exception):

@@ -112,7 +112,7 @@ def judge_check(
     cfg = job.cfg.caption
     judge = build(type(cfg.judge), cfg.judge.model_dump() | {"url": url}, "caption.judge")
     checked = check_judge(judge, vocabulary_of(cfg), gold_conflicts()[:limit], job.cfg.seed)
-    report = run_until_interrupted(checked)
+    report = run_until_interrupted(checked, keeps_work=False)
     head = ("figure", "value", "meaning")
     options.print_table(head, report.rows(), f"Judge {report.model}", left=head)
 

@@ -16,7 +16,10 @@ from cosfly.formats.captions import Usage
 
 Result = TypeVar("Result")
 CountName = Literal["prompt_tokens", "completion_tokens"]
-AT_ONCE = b"error: interrupted at once; recorded answers are kept; run the same command again to continue\n"
+AT_ONCE = {
+    False: b"error: interrupted at once\n",
+    True: b"error: interrupted at once; recorded answers are kept; run the same command again to continue\n",
+}
 MOST_TOKENS = 10_000_000  # of one answer: longer than the context of any model
 STOP_AFTER_FAILURES = 20  # consecutive windows or samples without an answer after which a run ends
 
@@ -98,11 +101,14 @@ async def started(engine: Engine) -> AsyncIterator[None]:
         await engine.close()
 
 
-def run_until_interrupted(main: Coroutine[Any, Any, Result]) -> Result:
+def run_until_interrupted(main: Coroutine[Any, Any, Result], *, keeps_work: bool = True) -> Result:
     """Run a coroutine as `asyncio.run` does: Ctrl-C or SIGTERM cancels its tasks in order, a second ends the process.
 
-    When all tasks have ended, it raises KeyboardInterrupt, or SystemExit as the command line does. Otherwise each
-    cancelled task would print a traceback. Journals survive an end at any time.
+    After the first one it raises KeyboardInterrupt, or SystemExit as the command line does, when all tasks have ended.
+    Otherwise each cancelled task would print a traceback. Journals survive an end at any time.
+
+    Args:
+        keeps_work: Whether answers are recorded, for the message.
     """
     if threading.current_thread() is not threading.main_thread():
         return asyncio.run(main)
@@ -116,7 +122,7 @@ def run_until_interrupted(main: Coroutine[Any, Any, Result]) -> Result:
         def interrupt(number: signal.Signals) -> None:
             nonlocal received
             if received is not None:
-                os.write(2, AT_ONCE)
+                os.write(2, AT_ONCE[keeps_work])
                 os._exit(128 + number)
             received = number
             task.cancel()

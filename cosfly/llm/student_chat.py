@@ -28,6 +28,10 @@ class StudentEndpointConfig(EndpointConfig):
 
     own_names: ClassVar[dict[str, str]] = {
         "caption.endpoint.max_tokens": "distill.infer.max_new_tokens",
+        "caption.endpoint.json_schema": "distill.infer.constrained",
+        "caption.endpoint (temperature, top_p, max_tokens, extra_body)": "distill.infer.endpoint.extra_body",
+        " or fewer (caption.image.modalities, caption.image.layout=tiled)": "",
+        "caption.image.modalities=[] or ": "",
         "caption.endpoint": "distill.infer.endpoint",
         "caption.image.max_side_px": "distill.infer.max_pixels",
     }
