@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -136,13 +136,13 @@ class ImageConfig(Config):
     depth_range_m: float = Field(DEPTH_RANGE_M, gt=0, description="depth at the dark end of the pseudo-colour, m")
 
 
-class JudgeConfig(Config):
+class JudgeConfig(EndpointConfig):
     """A language model that judges conflicts between a decision and the label; it never excuses a hard conflict."""
 
+    own_names: ClassVar[dict[str, str]] = {"caption.endpoint": "caption.judge"}
     url: str | None = Field(None, description="OpenAI-compatible endpoint of the judge; empty: no judge")
-    model: str | None = Field(None, description="name of the model; empty: the endpoint's only model")
-    concurrency: MayDiffer[int] = Field(16, ge=1, le=4096, description="most requests in flight")
-    extra_body: dict[str, Any] = Field(default_factory=dict, description="further fields of the request")
+    temperature: float = Field(0.0, ge=0, le=2, description="sampling temperature; 0 is greedy")
+    max_tokens: int = Field(512, ge=64, description="longest judgement, tokens")
 
     @model_validator(mode="after")
     def _is_url(self) -> Self:

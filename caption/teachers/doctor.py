@@ -81,7 +81,8 @@ class _Examination:
     advance: Advance
     most_requests: int | None
     num_requests: int = 0
-    tokens_per_s: float | None = None  # of the first answer; None: not reported
+    seconds: float = 0.0  # of the last request
+    tokens_per_s: float | None = None  # of the last answer that reports its tokens
     findings: list[Finding] = field(default_factory=list)
 
     async def run(self) -> list[Finding]:
@@ -108,14 +109,20 @@ class _Examination:
     async def _ask(self, messages: list[dict], max_tokens: int, schema: dict | None = None) -> Reply | str:
         """Return the reply to one request, or why it failed."""
         endpoint = self.cfg.endpoint.model_copy(update={"max_tokens": max_tokens})
+        start_s = time.monotonic()
         try:
-            return await self.client.ask(endpoint.request(messages, [], schema or {}, seed=0), self._count)
+            reply = await self.client.ask(endpoint.request(messages, [], schema or {}, seed=0), self._count)
         except (TimeoutError, httpx.RequestError) as error:
             return self.client.message_of(error)
         except Refusal as refusal:
             return str(refusal) + ("" if refusal.meaning == MEANINGS["unknown"] else f"; {refusal.meaning.fix}")
         except BadReply as error:
             return str(error)
+        finally:
+            self.seconds = time.monotonic() - start_s
+        if reply.usage is not None and reply.usage.completion_tokens:
+            self.tokens_per_s = reply.usage.completion_tokens / self.seconds
+        return reply
 
     def _count(self) -> None:
         if self.num_requests == self.most_requests:
@@ -124,17 +131,13 @@ class _Examination:
         self.advance(1, f"{self.num_requests} requests sent")
 
     async def _answers(self) -> bool:
-        start_s = time.monotonic()
         reply = await self._ask([_user(READY)], self.cfg.endpoint.max_tokens)
-        seconds = time.monotonic() - start_s
         problem = reply if isinstance(reply, str) else _problem_of(reply)
         if isinstance(reply, str) or problem is not None:
             self._add("answers", "unusable", problem or "")
             return False
         text = reply.text.strip()
-        if reply.usage is not None and reply.usage.completion_tokens:
-            self.tokens_per_s = reply.usage.completion_tokens / seconds
-        self._add("answers", "ok", f"{text[:40]!r} after {seconds:.1f} s")
+        self._add("answers", "ok", f"{text[:40]!r} after {self.seconds:.1f} s (any text counts)")
         is_off = not reply.num_thoughts and "<think" not in text
         fix = f"the model thinks before it answers; switch thinking off with {NO_THINKING}"
         self._add("thinking", "ok" if is_off else "warning", "off" if is_off else fix)
@@ -186,12 +189,14 @@ class _Examination:
     async def _try_largest(self) -> None:
         """Send a prompt as long as ours get, with our answer limit and schema; report context and time."""
         limit, context = self.cfg.endpoint.max_tokens, self.client.context
-        start_s = time.monotonic()
         reply = await self._ask(self.largest, limit, answer_schema(more=THEREFORE))
-        seconds = time.monotonic() - start_s
         if isinstance(reply, str):
-            self._report_no_answer(reply, is_slow=seconds >= self.cfg.endpoint.timeout_s)
+            if self.seconds >= self.cfg.endpoint.timeout_s:
+                self._report_too_slow()
+            else:
+                self._add("context length", "unusable", f"the largest prompt gets no answer: {reply}")
             return
+        seconds = self.seconds
         used, known = _prompt_tokens(reply), f" of the context of {context}" if context else ""
         detail = f"{used or 'unknown'} tokens of the largest prompt and {limit} for the answer"
         if context and used is not None and used + limit > context:
@@ -203,15 +208,22 @@ class _Examination:
             self._add("context length", "ok", f"{detail}{known}")
         self._report_speed(seconds)
 
-    def _report_no_answer(self, problem: str, *, is_slow: bool) -> None:
-        """Report that the largest prompt gets no answer, and what helps a slow server."""
-        limit = self.cfg.endpoint.max_tokens
-        if is_slow and self.tokens_per_s:
-            problem += f". At {self.tokens_per_s:.1f} tokens/s, as in the short first answer, {limit} tokens "
-            problem += f"(caption.endpoint.max_tokens) take {limit / self.tokens_per_s:.0f} s"
-        if is_slow and self.cfg.endpoint.json_schema:
-            problem += ". Some servers are slow with a JSON schema: try caption.endpoint.json_schema=false"
-        self._add("speed" if is_slow else "context length", "unusable", f"the largest prompt gets no answer: {problem}")
+    def _report_too_slow(self) -> None:
+        """Report that the largest prompt gets no answer in time, and what helps."""
+        endpoint = self.cfg.endpoint
+        detail = f"the largest prompt gets no answer within {endpoint.timeout_s:g} s"
+        longer_s = 2 * endpoint.timeout_s
+        if self.tokens_per_s:
+            answer_s = endpoint.max_tokens / self.tokens_per_s
+            detail += (
+                f"; at {self.tokens_per_s:.1f} tokens/s, as in the answer before, {endpoint.max_tokens} tokens take"
+            )
+            detail += f" {answer_s:.0f} s"
+            longer_s = max(longer_s, 2 * answer_s)  # as much again for the prompt
+        detail += f"; set caption.endpoint.timeout_s={longer_s:.0f}, lower caption.endpoint.max_tokens"
+        if endpoint.json_schema:
+            detail += ", set caption.endpoint.json_schema=false (some servers are slow with a schema)"
+        self._add("speed", "unusable", f"{detail}, or use a faster server or a smaller model")
 
     def _report_speed(self, seconds: float) -> None:
         """Report the time of the answer to the largest prompt."""

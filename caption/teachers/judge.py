@@ -18,8 +18,8 @@ from cosfly.formats.captions import Coc, JudgeRecord
 from cosfly.formats.places import flight_of
 from cosfly.llm.answer_text import object_schema
 from cosfly.llm.answers import AnswerBook, Budget, KeptAnswers
-from cosfly.llm.client import ChatClient, EndpointConfig
-from cosfly.llm.contract import NoAnswer, Request, started
+from cosfly.llm.client import ChatClient
+from cosfly.llm.contract import NoAnswer, started
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.io import read_unpacked
 from cosfly.runtime.json_io import Record, dump_json, parse_document, validated
@@ -28,7 +28,6 @@ from cosfly.runtime.model_json import find_object
 GOLD = Path(__file__).with_name("gold.jsonl.gz")
 JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
 UNJUDGED = "unjudged"
-MAX_TOKENS, MAX_TRIES = 512, 6  # of a judgement
 
 _MEANINGS: dict[Judgement, str] = {
     "ACCEPT_ALTERNATIVE": "the reasoning is sound and its decision is an acceptable alternative to the label",
@@ -78,15 +77,14 @@ class Judge:
     """A model that is asked about conflicts. Made by `open_judge`."""
 
     def __init__(self, kept: KeptAnswers, cfg: JudgeConfig, vocabulary: Vocabulary, seed: int) -> None:
-        self.kept, self.vocabulary = kept, vocabulary
-        self.sampling = {"temperature": 0.0, "seed": seed, "max_tokens": MAX_TOKENS, **cfg.extra_body}
+        self.kept, self.cfg, self.vocabulary, self.seed = kept, cfg, vocabulary, seed
 
     async def judge(self, conflict: Conflict, order: Sequence[Judgement] = JUDGEMENTS) -> JudgeRecord:
         """Return the verdict on a conflict, `unjudged` without a readable answer. BudgetSpent: A limit is reached."""
         messages = judge_messages(conflict, self.vocabulary, order)
         verdicts = {"type": "string", "enum": list(order)}
         schema = object_schema({"verdict": verdicts, "reason": {"type": "string", "minLength": 1, "maxLength": 600}})
-        request = Request(messages, [], schema, self.sampling)
+        request = self.cfg.request(messages, [], schema, self.seed)
         try:
             reply = await self.kept.ask(request, flight_of(conflict.sample_id), conflict.sample_id, "judge")
         except NoAnswer as error:  # not journaled: a later run may ask again
@@ -112,8 +110,7 @@ async def open_judge(
     if cfg.url is None:
         yield None
         return
-    endpoint = EndpointConfig(model=cfg.model, concurrency=cfg.concurrency, max_tries=MAX_TRIES)
-    client = ChatClient(cfg.url, endpoint)
+    client = ChatClient(cfg.url, cfg)
     async with started(client):
         yield Judge(KeptAnswers(client, book, budget), cfg, vocabulary, seed)
 

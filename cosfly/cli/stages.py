@@ -29,7 +29,7 @@ BACKEND = SettingOption("render.backend", "Renderer: gl, pyrender, carla or unre
     planner=SettingOption(
         "world.planner", "Language model that plans the world; by default, built-in rules.", metavar="URL"
     ),
-    model=SettingOption("world.model", "Name of the language model."),
+    model=SettingOption("world.endpoint.model", "Name of the language model."),
 )
 def world(
     job: Job,

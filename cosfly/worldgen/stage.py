@@ -5,7 +5,7 @@ import logging
 import re
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import shapely
@@ -39,6 +39,11 @@ MOST_CHARACTERS = 2000  # of a prompt
 ROAD_COST = 20  # a metre of carriageway away from crossings costs as much as 20 m of pavement
 
 
+class PlannerEndpointConfig(EndpointConfig):
+    own_names: ClassVar[dict[str, str]] = {"caption.endpoint": "world.endpoint"}
+    max_tokens: int = Field(2048, ge=64, description="longest plan, tokens")
+
+
 class WorldConfig(Config):
     """A world from text."""
 
@@ -47,7 +52,7 @@ class WorldConfig(Config):
     planner: str | None = Field(
         None, description="URL of the language model that plans the world; empty: built-in rules plan it"
     )
-    model: str | None = Field(None, description="name of the language model; empty: the endpoint's only model")
+    endpoint: PlannerEndpointConfig = Field(PlannerEndpointConfig(), description="requests to the language model")
 
 
 def check_world(town: Town, plan: WorldPlan) -> list[dict[str, Any]]:
@@ -105,14 +110,13 @@ Choose ranges wide enough that a random town meets them, and as narrow as the us
 
 def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tuple[WorldPlan, dict[str, Any]]:
     """Return a model's plan of a prompt, asked for or recorded, and the trace: the question and the answer."""
-    endpoint = EndpointConfig(model=cfg.model, max_tokens=2048)
     fields = "\n".join(
         f"- {name}: {field.description}; else {field.default!r}" for name, field in WorldPlan.model_fields.items()
     )
     task = TASK.format(fields=fields, objects=", ".join(OBJECTS))
     messages = [{"role": "system", "content": task}, {"role": "user", "content": prompt}]
-    request = endpoint.request(messages, [], WorldPlan.model_json_schema(), seed)
-    client = ChatClient(cfg.planner or "", endpoint)
+    request = cfg.endpoint.request(messages, [], WorldPlan.model_json_schema(), seed)
+    client = ChatClient(cfg.planner or "", cfg.endpoint)
     name = sha256_bytes(prompt.encode())[:16]
 
     async def ask() -> Reply:
