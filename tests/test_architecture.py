@@ -164,7 +164,7 @@ ALLOWED_TO_READ = {
     ("cosfly.runtime.ray_engine", "loads"),  # what a worker says, as `multiprocessing` reads it from a pipe
     ("cosfly.runtime.events", "read_bytes"),  # /proc, whose files have no size
     ("cosfly.runtime.limits", "read_text"),  # the same, and control groups
-    ("cosfly.runtime.png", "decompress"),  # of a picture, up to the size that its header gives
+    ("cosfly.runtime.png", "open"),  # a picture in memory, whose size was checked
     ("cosfly.llm.protocol", "loads"),  # the reply, of a bounded size
     ("distill.training.checkpoints", "load_file"),  # tensors of this training
     ("cosfly.simulators.guard", "loads"),  # lines of the process that started it

@@ -45,7 +45,6 @@ def answer(capfd, monkeypatch, *words: str) -> tuple[int, str]:
 def test_what_an_option_does_not_take_is_told_in_words_for_people(capfd, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     for words, told in (
-        ("run quickstart --resume maybe", "'maybe' is not one of 'never', 'if-same'"),
         ("run quickstart --workers two", "valid integer, unable to parse string as an integer"),
         ("caption --tracks x", "'x' is not one of 'clean', 'perturbed', 'both'"),
         ("plan --out x", "Missing option '--map'"),
@@ -162,15 +161,15 @@ def test_every_common_option_of_a_command_is_taken_by_a_function_that_it_calls()
             common = [*decorator.args[2:3], *(k.value for k in decorator.keywords if k.arg == "common")]
             listed = set(eval(ast.unparse(common[0]), names).split()) if common else set()  # a constant of `options`
             body = ast.unparse(function.body)
-            taken = {name for name in ("seed", "resume", "workers") if f"job.{name}" in body or f"{name}=" in body}
+            taken = {name for name in ("seed", "workers") if f"job.{name}" in body or f"{name}=" in body}
             if re.search(r"\(job, |\(job\.cfg, ", body):  # which holds seed and workers
                 taken |= {"seed", "workers"}
             for target in re.findall(r"job\.(?:call|run)\('([\w.:]+)'", body):
                 module, _, name = target.partition(":")
                 parameters = signature(getattr(importlib.import_module(module), name or "run")).parameters
                 is_open = any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters.values())
-                taken |= {"seed", "resume", "workers"} if is_open else {*parameters}
-            assert listed & {"seed", "resume", "workers"} <= taken, function.name
+                taken |= {"seed", "workers"} if is_open else {*parameters}
+            assert listed & {"seed", "workers"} <= taken, function.name
             commands += 1
     assert commands > 30
 
@@ -224,7 +223,10 @@ def test_a_setting_that_is_not_there_is_told_its_place_or_its_neighbours():
     for given, words in (
         ("altitude_max_m=40", r"altitude_max_m: unknown setting \(did you mean 'plan\.altitude_max_m'\?\)"),
         ("render.altitude_max_m=40", r"render\.altitude_max_m: .*\(did you mean 'plan\.altitude_max_m'\?\)"),
-        ("endpoint.json_schema=false", r"did you mean 'caption\.endpoint' or 'distill\.infer\.endpoint'\?"),
+        (
+            "endpoint.json_schema=false",
+            r"did you mean 'caption\.endpoint' or 'world\.endpoint' or 'distill\.infer\.endpoint'\?",
+        ),
         ("plan.wokers=2", r"plan\.wokers: unknown setting"),
         ("render.fovs_deg=60", r"render\.fovs_deg: the value is not a list, got 60; write \[60\]"),
     ):

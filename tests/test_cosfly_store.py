@@ -138,8 +138,6 @@ def test_other_settings_and_inputs_are_named(tmp_path):
     ):
         with pytest.raises(ResumeError, match=words):
             _open(out, inputs=inputs, **changes)
-        with pytest.raises(ResumeError, match="already contains results"):
-            _open(out, inputs=inputs, **changes, resume="never")
     write_json(source, 2)
     with pytest.raises(ResumeError, match="the input map"):
         _open(out, inputs=inputs)

@@ -28,7 +28,7 @@ from cosfly.runtime.errors import ConfigError, ResumeError, TeacherError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import write_model
 from cosfly.runtime.pool import Watch, run_items
-from cosfly.runtime.run_dir import Resume, StageFolder, Tally, read_manifest
+from cosfly.runtime.run_dir import StageFolder, Tally, read_manifest
 from cosfly.runtime.worker import Item, Outcome, Work, advance
 from cosfly.viz.page import run_name
 
@@ -46,7 +46,6 @@ def run(
     seed: int = 0,
     workers: int = 0,
     watch: Watch = Watch(),
-    resume: Resume = "if-same",
     retry_failed: bool = False,
 ) -> Path:
     """Write captions of the tracks of a playback tree; return the path of `captions.jsonl`.
@@ -67,7 +66,7 @@ def run(
     vocabulary = vocabulary_of(cfg)
     cfg = student_settings(cfg, vocabulary)
     unused = set[str]() if cfg.caption_file is None else {sample_id for sample_id, _ in read_given(cfg)[0]}
-    stage = open_stage(cfg, data, out, seed, resume)
+    stage = open_stage(cfg, data, out, seed)
     if stage.is_complete and not _has_more(stage, cfg, retry_failed):
         _remove_parts(stage)  # the process may have been killed before it removed them
         return out / PRODUCT
@@ -165,15 +164,13 @@ def _remove_parts(stage: StageFolder) -> None:
         shutil.rmtree(stage.path / PARTS, ignore_errors=True)
 
 
-def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Resume) -> StageFolder:
+def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int) -> StageFolder:
     """Open the output directory for these settings."""
     inputs = {"data": data} if cfg.caption_file is None else {"data": data, "captions": cfg.caption_file}
     if cfg.student.folder is not None:
         inputs |= student_files(cfg.student.folder)
     files = PACKAGE_FILES | {"prompts": cfg.prompts or PROMPTS}
-    return StageFolder.open(
-        out, "caption", config=cfg, inputs=inputs, seed=seed, resume=resume, package_files=files, retries=False
-    )
+    return StageFolder.open(out, "caption", config=cfg, inputs=inputs, seed=seed, package_files=files, retries=False)
 
 
 def _has_more(stage: StageFolder, cfg: CaptionConfig, retry_failed: bool) -> bool:

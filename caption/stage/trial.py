@@ -24,14 +24,11 @@ from cosfly.llm.answers import AnswerBook, Budget
 from cosfly.llm.contract import NoAnswer, Reply, Request, run_until_interrupted
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError, TeacherError
 from cosfly.runtime.escaping import LONGEST_LOG, for_terminal
-from cosfly.runtime.run_dir import Resume
 
 log = logging.getLogger(__name__)
 
 
-def show_windows(
-    cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *, seed: int = 0, resume: Resume = "if-same"
-) -> Iterator[str]:
+def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *, seed: int = 0) -> Iterator[str]:
     """Yield the lines that show a few windows: each question and answer, and what became of the window.
 
     Raises:
@@ -42,7 +39,7 @@ def show_windows(
         raise ConfigError(what, where="--try", got=f"--teacher {cfg.teacher}", expected=expected)
     vocabulary = vocabulary_of(cfg)
     cfg = student_settings(cfg, vocabulary)
-    if open_stage(cfg, data, out, seed, resume).is_complete:
+    if open_stage(cfg, data, out, seed).is_complete:
         what, fix = "the directory is complete, so no window is left to try", "choose another --out"
         raise InputError(what, where=out, fix=fix)
     tracks, _ = find_inputs(cfg, data)

@@ -18,7 +18,7 @@ JUDGED = "captions.jsonl of `caption --teacher student:PATH`, one per tree; repe
 LIMIT = SettingOption("distill.prepare.limit", "Windows in all splits, chosen at random; 0 for all.", int)
 
 
-@command("cosfly distill prepare runs/diverse --out dataset", "distill", "seed resume", limit=LIMIT)
+@command("cosfly distill prepare runs/diverse --out dataset", "distill", "seed", limit=LIMIT)
 def prepare(
     job: Job,
     out: options.Out,
@@ -38,7 +38,7 @@ def prepare(
     job.run("distill.prepare.stage", job.cfg.distill.prepare, sources, out)
 
 
-@command("cosfly distill dual-track runs/diverse --out windows", "distill", "seed resume")
+@command("cosfly distill dual-track runs/diverse --out windows", "distill", "seed")
 def dual_track(job: Job, out: options.Out, runs: options.Runs = None, data: options.Trees = None) -> None:
     """Make windows over clean and perturbed tracks, by split, to learn denoising and prediction from."""
     trees = [folder / "render" for folder in options.each_run(runs)]
@@ -54,7 +54,7 @@ def _trees(job: Job, dataset: Path, data: list[Path] | None) -> list[Path]:
     return job.trees(data) if data or read_training_set(dataset).trees else []
 
 
-@command("cosfly distill train --dataset dataset --student Qwen/Qwen3.5-2B --out student", "distill", "seed resume")
+@command("cosfly distill train --dataset dataset --student Qwen/Qwen3.5-2B --out student", "distill", "seed")
 def train(
     job: Job,
     dataset: Dataset,
@@ -73,7 +73,7 @@ ENGINE = SettingOption("distill.infer.engine", "transformers, endpoint (a server
 INFER = "cosfly distill infer --dataset dataset --model Qwen/Qwen3.5-2B --out predictions"
 
 
-@command(INFER, "distill", "resume", engine=ENGINE)
+@command(INFER, "distill", engine=ENGINE)
 def infer(
     job: Job,
     dataset: Dataset,
@@ -87,7 +87,7 @@ def infer(
     job.run("distill.inference.stage", cfg, dataset, _trees(job, dataset, data), model, out, adapter=adapter)
 
 
-@command("cosfly distill merge --model models/Qwen3.5-2B --adapter student/adapter --out merged", common="resume")
+@command("cosfly distill merge --model models/Qwen3.5-2B --adapter student/adapter --out merged")
 def merge(
     job: Job,
     model: Annotated[Path, Option(help="Base model of the student: folder, repository or GGUF file.")],
@@ -98,7 +98,7 @@ def merge(
     job.run("distill.inference.merge", model, adapter, out)
 
 
-@command("cosfly distill evaluate --dataset dataset --predictions student-2B --out scores", common="seed resume")
+@command("cosfly distill evaluate --dataset dataset --predictions student-2B --out scores", common="seed")
 def evaluate(
     job: Job,
     dataset: Dataset,
@@ -168,7 +168,7 @@ def fly(
         job.run("cosfly.closed_loop.stage", run, map_, simplified or map_, paths, out, others=others)
 
 
-@command("cosfly leaderboard rules=flown0 student=flown1 --out board", common="resume")
+@command("cosfly leaderboard rules=flown0 student=flown1 --out board")
 def leaderboard(
     job: Job,
     folders: Annotated[list[str], Argument(metavar="[NAME=]DIR...", help="Outputs of `cosfly fly`, by student.")],

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from cosfly.pipeline.settings import RunConfig
-    from cosfly.runtime.run_dir import Resume, Tally
+    from cosfly.runtime.run_dir import Tally
 
 log = logging.getLogger(__name__)
 
@@ -73,7 +73,6 @@ GLOB_HELP = "Only tracks whose folder, or one above it, matches: 'Town01/traject
 ENGINE_HELP = "Where workers run: in processes of this machine, or on the nodes of a Ray cluster."
 ADDRESS_HELP = "Head node for --engine ray, or auto; by default $RAY_ADDRESS, or a cluster on this machine."
 CONFIG_HELP = "Settings: a YAML file, a shipped configuration, or a run directory."
-RESUME_HELP = "With existing work in the output directory: refuse, or resume if settings and inputs agree."
 COMMON_SETTINGS = {
     "seed": SettingOption("seed", "Seed; every random choice derives from it.", int),
     "workers": SettingOption("workers", "Worker processes; 0: one per core, or with Ray as many as fit.", int),
@@ -84,10 +83,9 @@ COMMON_OPTIONS = [  # these set no setting
     _parameter("config", Path | None, Option("--config", "-c", help=CONFIG_HELP)),
     _parameter("overrides", list[str] | None, Option("--set", "-s", metavar="A.B=C", help="Set a setting; repeat it.")),
     _parameter("town", str | None, Option(help="Town of the configuration whose settings and seed are used.")),
-    _parameter("resume", Literal["never", "if-same"], Option(help=RESUME_HELP), "if-same"),
 ]
 WORKERS = "workers engine address"
-STAGE = f"town seed {WORKERS} resume"  # common options of a stage whose items workers process
+STAGE = f"town seed {WORKERS}"  # common options of a stage whose items workers process
 
 
 def track_options(
@@ -107,13 +105,12 @@ class Job:
     """The resolved settings of a command."""
 
     cfg: RunConfig
-    resume: Resume = "if-same"
     set_by_options: Collection[str] = ()  # names of the settings that the user set by options of the command
 
     def call(self, target: str, *arguments: Any, **keywords: Any) -> Any:
         """Import a function and call it with the arguments, and with the common arguments that it takes.
 
-        The common arguments are `seed`, `resume`, `workers` and `watch`. The function gets each of them that is in its
+        The common arguments are `seed`, `workers` and `watch`. The function gets each of them that is in its
         signature, or all if it takes any keyword; `keywords` replace them. A command imports its stage by this call,
         so that the help of the command line loads no stage.
 
@@ -124,7 +121,7 @@ class Job:
 
         module, _, name = target.partition(":")
         function = getattr(importlib.import_module(module), name or "run")
-        common = {"seed": self.cfg.seed, "resume": self.resume, **worker_options(self.cfg)}
+        common = {"seed": self.cfg.seed, **worker_options(self.cfg)}
         parameters = signature(function).parameters
         if not any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters.values()):
             common = {key: value for key, value in common.items() if key in parameters}
@@ -237,7 +234,7 @@ def command(
             cfg = resolve(values["config"], values["overrides"], settings, used)
             if "town" in listed:
                 cfg = _town_of(cfg, values["town"])
-            job = Job(cfg, values.get("resume", "if-same"), settings)
+            job = Job(cfg, settings)
             try:
                 function(job, **{name: _opened(cfg, values[name]) for name in own_names})
             except EOFError as error:  # click would print "Aborted." alone

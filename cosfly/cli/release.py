@@ -17,7 +17,7 @@ SELECTION = "Frames of each track: a uniform stride, runs that keep windows of c
 @command(
     "cosfly release build runs/diverse --out release",
     "release",
-    f"{WORKERS} resume",
+    f"{WORKERS}",
     **track_options("release", "flights", "tracks"),
     frames=SettingOption("release.num_frames", "Largest number of frames per track.", int, metavar="N"),
     selection=SettingOption("release.selection", SELECTION, Literal["stride", "windows", "all"]),
@@ -83,7 +83,7 @@ FORMATS = (
 Format = Literal["tree", "lerobot", "webdataset", "coco", "chat", "sharegpt"]
 
 
-@command("cosfly release export release --format webdataset --out shards", common="resume")
+@command("cosfly release export release --format webdataset --out shards")
 def export(
     job: Job,
     source: Annotated[Path, Argument(help="Release, or run directory with a release.")],

@@ -20,7 +20,7 @@ Until = Literal["maps", "simplify", "pedestrians", "plan", "render", "inspect", 
 PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
 
 
-@command("cosfly run quickstart --out runs/first", "*", f"seed {WORKERS} resume")
+@command("cosfly run quickstart --out runs/first", "*", f"seed {WORKERS}")
 def run(
     job: Job,
     config: Annotated[Path, Argument(help=CONFIG)],
@@ -37,7 +37,7 @@ def run(
         pipeline.check_with_files(job.cfg)
         _print_estimate(job.cfg, out)
     else:
-        results = pipeline.run(job.cfg, out, resume=job.resume, until=until)
+        results = pipeline.run(job.cfg, out, until=until)
         print_run(out)
         job.check_failures({result.stage.name: result.manifest.counts for result in results}, out)
 
@@ -98,7 +98,7 @@ def print_run(run: Path, *, with_settings: bool = False) -> None:
     options.print_lines(lines)
 
 
-@command("cosfly reproduce runs/first", "*", f"{WORKERS} resume")
+@command("cosfly reproduce runs/first", "*", f"{WORKERS}")
 def reproduce(
     job: Job,
     config: Annotated[

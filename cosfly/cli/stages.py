@@ -25,7 +25,7 @@ BACKEND = SettingOption("render.backend", "Renderer: gl, pyrender, carla or unre
 @command(
     'cosfly world "a small village by a river" --out village',
     "world",
-    "seed resume",
+    "seed",
     planner=SettingOption(
         "world.planner", "Language model that plans the world; by default, built-in rules.", metavar="URL"
     ),
@@ -51,13 +51,13 @@ def world(
         job.run("cosfly.worldgen.stage", cfg, folder, seed=seed)
 
 
-@command("cosfly maps --source synthetic --out maps", "maps", "town seed resume", source=SOURCE)
+@command("cosfly maps --source synthetic --out maps", "maps", "town seed", source=SOURCE)
 def maps(job: Job, out: options.Out) -> None:
     """Make boxes_3d.json, a map of boxes, from a map source (step 1)."""
     job.run("cosfly.maps.stage", job.cfg.maps, out, follow_links=job.cfg.follow_links)
 
 
-@command("cosfly simplify --map maps/boxes_3d.json --out simplify", "simplify", "town resume")
+@command("cosfly simplify --map maps/boxes_3d.json --out simplify", "simplify", "town")
 def simplify(job: Job, map_: options.Map, out: options.Out) -> None:
     """Merge, crop and prune boxes_3d.json into step2_simplified.json (step 2)."""
     job.run("cosfly.simplify.stage", job.cfg.simplify, map_, out)
@@ -171,7 +171,7 @@ def render(
 @command(
     "cosfly inspect --map step2_simplified.json --traces drone_trace.json --out inspect",
     "inspect",
-    f"town {WORKERS} resume",
+    f"town {WORKERS}",
     **track_options("inspect"),
 )
 def inspect(

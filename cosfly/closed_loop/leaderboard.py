@@ -14,7 +14,7 @@ from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, Record, write_model
-from cosfly.runtime.run_dir import Resume, StageFolder, Tally
+from cosfly.runtime.run_dir import StageFolder, Tally
 from cosfly.viz.page import page
 
 Role = Literal["student", "floor", "ceiling"]
@@ -44,7 +44,7 @@ class Leaderboard(Record):
     tables: tuple[StudentTable, ...]
 
 
-def run(folders: Sequence[tuple[str, Path]], out: Path, *, resume: Resume = "if-same") -> Path:
+def run(folders: Sequence[tuple[str, Path]], out: Path) -> Path:
     """Read named folders of `cosfly fly`; write `leaderboard.json` and `leaderboard.html`, and return the page's path.
 
     Args:
@@ -53,7 +53,7 @@ def run(folders: Sequence[tuple[str, Path]], out: Path, *, resume: Resume = "if-
     scores = [read_score(folder) for _, folder in folders]
     students = [(name or score.student, score) for (name, _), score in zip(folders, scores, strict=True)]
     inputs = {f"{number}/{name}": folder for number, (name, folder) in enumerate(folders)}
-    stage = StageFolder.open(out, "leaderboard", config=Config(), inputs=inputs, seed=0, resume=resume)
+    stage = StageFolder.open(out, "leaderboard", config=Config(), inputs=inputs, seed=0)
     path = out / "leaderboard.html"
     record = out / "leaderboard.json"
     if not stage.is_complete:

@@ -28,7 +28,7 @@ from cosfly.planners.stage import plan_on
 from cosfly.render import stage as rendering
 from cosfly.runtime.errors import ConfigError, InputError, NoPathError
 from cosfly.runtime.pool import Watch, run_items
-from cosfly.runtime.run_dir import Resume, StageFolder, read_stage_record
+from cosfly.runtime.run_dir import StageFolder, read_stage_record
 from cosfly.runtime.worker import Item, Outcome, Work, advance
 
 CAPTIONS = "caption"
@@ -36,7 +36,7 @@ CAPTIONS = "caption"
 
 def run(
     cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Path, out: Path, *, workers: int = 1,
-    watch: Watch = Watch(), resume: Resume = "if-same",
+    watch: Watch = Watch(),
 ) -> Path:  # fmt: skip
     """Read a folder of `cosfly fly` and its map; write `drone_trace.json`, the playback tree `render/` of the planner's
     continuations, and the teacher's `caption/` of it. Return the output directory.
@@ -52,7 +52,7 @@ def run(
             fix="fly the student again with --set plan.planner=foresight, and relabel with the same setting",
         )
     begun = (TREE, CAPTIONS)
-    stage = StageFolder.open(out, "relabel", config=cfg, inputs=inputs, seed=seed, resume=resume, begun=begun)
+    stage = StageFolder.open(out, "relabel", config=cfg, inputs=inputs, seed=seed, begun=begun)
     if not stage.is_complete:
         items = []
         for episode in sorted(score.episode for score in read_score(flown).flights):
@@ -63,7 +63,7 @@ def run(
         traces = [DroneTrace.from_json(outcome.result["trace"], "relabel") for outcome in done.kept]
         write_traces(stage.path / TRACES, traces, {"round": cfg.fly.relabel.round, "seed": seed})
         stage.finish([stage.path / TRACES], done.tally)
-    common: dict[str, Any] = {"seed": seed, "workers": workers, "watch": watch, "resume": resume}
+    common: dict[str, Any] = {"seed": seed, "workers": workers, "watch": watch}
     rendering.run(as_drawn(cfg.render, seed), boxes, simplified, out / TRACES, out / TREE, **common)
     captioning.run(cfg.caption, out / TREE, out / CAPTIONS, **common)
     return out

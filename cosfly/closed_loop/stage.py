@@ -47,7 +47,7 @@ from cosfly.runtime.io import sha256_file
 from cosfly.runtime.json_io import write_model
 from cosfly.runtime.limits import num_cpus
 from cosfly.runtime.pool import Watch, run_items
-from cosfly.runtime.run_dir import Resume, StageFolder, Tally
+from cosfly.runtime.run_dir import StageFolder, Tally
 from cosfly.runtime.worker import Item, Outcome, Work, advance
 from distill.inference.samples import InferConfig
 
@@ -134,7 +134,7 @@ class OpenEpisode:
 
 def run(
     cfg: ClosedLoopConfig, boxes: Path, simplified: Path, paths: Path, out: Path, *, seed: int = 0, workers: int = 1,
-    watch: Watch = Watch(), resume: Resume = "if-same", others: Path | None = None,
+    watch: Watch = Watch(), others: Path | None = None,
 ) -> Path:  # fmt: skip
     """Read a map, its obstacles, pedestrian trajectories and bystanders; write `plan/`, `episodes/`, the flown
     `drone_trace.json`, `score.json` and, if set, the playback tree `render/`. Return the output directory.
@@ -146,10 +146,10 @@ def run(
             got=f"render.frame_stride={cfg.render.frame_stride}",
             fix="remove the setting render.frame_stride",
         )
-    common: dict[str, Any] = {"seed": seed, "workers": workers, "watch": watch, "resume": resume}
+    common: dict[str, Any] = {"seed": seed, "workers": workers, "watch": watch}
     inputs = {"boxes": boxes, "simplified": simplified, "paths": paths} | ({"others": others} if others else {})
     stage = StageFolder.open(
-        out, "fly", config=cfg, inputs=inputs, seed=seed, resume=resume, package_files={"controller": CONTROLLER_FILE},
+        out, "fly", config=cfg, inputs=inputs, seed=seed, package_files={"controller": CONTROLLER_FILE},
         begun=(PLAN, TREE),
     )  # fmt: skip
     if not stage.is_complete:

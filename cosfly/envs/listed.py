@@ -10,7 +10,7 @@ from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory
 from cosfly.envs import episodes as benchmark
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.pool import Watch
-from cosfly.runtime.run_dir import Resume, StageFolder
+from cosfly.runtime.run_dir import StageFolder
 
 
 class ListConfig(ClosedLoopConfig):
@@ -19,13 +19,11 @@ class ListConfig(ClosedLoopConfig):
     env: str  # environment and list, as in `read_list`
 
 
-def run(
-    cfg: ListConfig, out: Path, *, seed: int = 0, workers: int = 1, watch: Watch = Watch(), resume: Resume = "if-same"
-) -> Path:
+def run(cfg: ListConfig, out: Path, *, seed: int = 0, workers: int = 1, watch: Watch = Watch()) -> Path:
     """Fly each episode of a list; write `episodes/` and `score.json`. Return the output directory."""
     task, episodes, digest = benchmark.read_list(cfg.env)
     files = {"controller": CONTROLLER_FILE, "episodes": benchmark.EPISODES_FILE}
-    stage = StageFolder.open(out, "fly", config=cfg, inputs={}, seed=seed, resume=resume, package_files=files)
+    stage = StageFolder.open(out, "fly", config=cfg, inputs={}, seed=seed, package_files=files)
     if not stage.is_complete:
         flown = [(benchmark.episode_id(*episode), episode, benchmark.NUM_DECISIONS) for episode in episodes]
         # A model answers all towns as one batch; otherwise a worker opens one town at a time.

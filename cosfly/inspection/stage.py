@@ -30,7 +30,7 @@ from cosfly.inspection.track import InspectedTrack, inspect_track, trace_id
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.pool import ItemOutcomes, Watch, run_items
-from cosfly.runtime.run_dir import Failed, Resume, StageFolder, result_of
+from cosfly.runtime.run_dir import Failed, StageFolder, result_of
 from cosfly.runtime.worker import Item, Outcome, Work
 from cosfly.viz.page import run_name
 
@@ -64,7 +64,6 @@ def run(
     *,
     workers: int = 0,
     watch: Watch = Watch(),
-    resume: Resume = "if-same",
 ) -> Path:
     """Read the simplified map, the plans and the playback tree; write `inspect.json` and `report.html`. Return the path
     of `inspect.json`.
@@ -78,7 +77,7 @@ def run(
     optional_inputs = {"simplified": simplified, "traces": traces, "data": data}
     inputs = {name: path for name, path in optional_inputs.items() if path is not None}
     # A track that was changed after rendering does not stop the stage: it is rejected.
-    stage = StageFolder.open(out, "inspect", config=cfg, inputs=inputs, seed=0, resume=resume, audited=("data",))
+    stage = StageFolder.open(out, "inspect", config=cfg, inputs=inputs, seed=0, audited=("data",))
     product = out / "inspect.json"
     if stage.is_complete:
         return product

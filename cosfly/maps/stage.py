@@ -21,7 +21,7 @@ from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig
 from cosfly.runtime.config import Config
 from cosfly.runtime.io import LinkedPath, write_bytes
-from cosfly.runtime.run_dir import Resume, StageFolder, Tally
+from cosfly.runtime.run_dir import StageFolder, Tally
 from cosfly.viz.topview import TopView, draw_map, png_bytes
 
 log = logging.getLogger(__name__)
@@ -70,10 +70,10 @@ def load_map(cfg: MapsConfig, *, seed: int = 0, follow_links: bool = False) -> B
     return replace(box_map, meshes=replace(box_map.meshes, folder=LinkedPath(box_map.meshes.folder)))
 
 
-def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same", follow_links: bool = False) -> Path:
+def run(cfg: MapsConfig, out: Path, *, seed: int = 0, follow_links: bool = False) -> Path:
     """Read the source's files, if it has any; write `boxes_3d.json` and the overview `map.png`."""
     inputs = getattr(cfg, cfg.source).inputs()
-    stage = StageFolder.open(out, "maps", config=cfg, inputs=inputs, seed=seed, resume=resume)
+    stage = StageFolder.open(out, "maps", config=cfg, inputs=inputs, seed=seed)
     product = out / "boxes_3d.json"
     if stage.is_complete:
         return product

@@ -36,7 +36,7 @@ from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, write_json
 from cosfly.runtime.pool import Watch, run_items
-from cosfly.runtime.run_dir import Resume, StageFolder, result_of
+from cosfly.runtime.run_dir import StageFolder, result_of
 from cosfly.runtime.seeding import draw_by_share, rng_for
 from cosfly.runtime.worker import Item, Outcome, Work
 from cosfly.viz.topview import PAPER, TopView, add_caption, draw_dot, draw_line, png_bytes
@@ -172,13 +172,13 @@ def _write_bystanders(path: Path, records: list[dict], header: dict, cfg: Pedest
 
 def run(
     cfg: PedestriansConfig, simplified_map: Path, out: Path, *, seed: int = 0, workers: int = 0,
-    watch: Watch = Watch(), resume: Resume = "if-same", roi: Path | None = None,
+    watch: Watch = Watch(), roi: Path | None = None,
 ) -> Path:  # fmt: skip
     """Read `step2_simplified.json` (and `roi`, a region of interest); write `path.json`, a report and `paths.png`, and
     `others.json` if there are bystanders; return the path of `path.json`. Failed trajectories are counted.
     """
     inputs = {"map": simplified_map} | ({"roi": roi} if roi else {})
-    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed)
     product = out / "path.json"
     if stage.is_complete:
         return product

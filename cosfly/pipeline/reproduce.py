@@ -50,7 +50,7 @@ from cosfly.runtime.journal import Journal
 from cosfly.runtime.json_io import FileFormat, read_object, write_json
 from cosfly.runtime.limits import num_cpus
 from cosfly.runtime.png import read_picture
-from cosfly.runtime.run_dir import Manifest, Resume, read_manifest
+from cosfly.runtime.run_dir import Manifest, read_manifest
 from cosfly.studies import depth, weather, zoom
 from cosfly.viz.frame_views import small_jpeg
 from cosfly.viz.gallery import four_panels
@@ -130,9 +130,7 @@ def read_paper() -> Paper:
     return build(Paper, read_yaml(path), path)
 
 
-def run(
-    cfg: RunConfig, folder: Path, out: Path, *, pedestrians: int = 20, seed: int = 0, resume: Resume, **pool: Any
-) -> Path:
+def run(cfg: RunConfig, folder: Path, out: Path, *, pedestrians: int = 20, seed: int = 0, **pool: Any) -> Path:
     """Read a run directory; write `reproduction.html` and `reproduction.json`, and return the page."""
     done = [stage.name for stage in summarize(folder).stages if stage.state == "complete"]
     if missing := [name for name in STAGES if name not in done]:
@@ -141,7 +139,7 @@ def run(
             what = "the run has several towns, and its directory itself has no drone trajectories"
             fix = f"pass the directory of one town, such as {folder}/{next(iter(cfg.towns))}"
         raise InputError(what, where=folder, got=f"no results of the stages {', '.join(missing)}", fix=fix)
-    sample = measure(cfg, folder, out, pedestrians, done, pool | {"seed": seed, "resume": resume})
+    sample = measure(cfg, folder, out, pedestrians, done, pool | {"seed": seed})
     reader = FigureReader([folder, out], {} if sample is None else {"sample": sample})
     reader.derived |= derived_figures(cfg, folder, reader, done)
     paper = read_paper()
@@ -406,7 +404,7 @@ def measure(
 
     Args:
         done: Complete stages of the run.
-        options: `seed`, `resume`, `workers` and `watch` of stages.
+        options: `seed`, `workers` and `watch` of stages.
     """
     boxes = folder / "maps/boxes_3d.json"
     simplified = folder / "simplify/step2_simplified.json"

@@ -26,7 +26,7 @@ from cosfly.pipeline.runs import STAGES
 from cosfly.pipeline.settings import RunConfig, run_checks
 from cosfly.runtime.errors import ConfigError, InputError, ResumeError
 from cosfly.runtime.io import write_bytes
-from cosfly.runtime.run_dir import Manifest, Resume, hold_folder, read_manifest
+from cosfly.runtime.run_dir import Manifest, hold_folder, read_manifest
 from cosfly.viz.gallery import contact_sheet
 from cosfly.viz.viewer import run as write_viewer
 from release.build.sources import Source, choose_licence
@@ -51,7 +51,7 @@ class StageResult:
     was_complete: bool
 
 
-def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[Stage]:
+def stages(cfg: RunConfig, out: Path) -> list[Stage]:
     """Return the stages of a run in order; each works in the folder of its name in the run directory."""
     seed = cfg.seed
     pool = worker_options(cfg)
@@ -64,7 +64,7 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[Sta
     sources = [Source.of_files(tree, out / "caption/captions.jsonl", out / "inspect/inspect.json")]
 
     def stage(name: str, run: Callable[..., Path], *inputs: Any, **options: Any) -> Stage:
-        return Stage(name, partial(run, getattr(cfg, name), *inputs, out / name, resume=resume, **options))
+        return Stage(name, partial(run, getattr(cfg, name), *inputs, out / name, **options))
 
     return [
         stage("maps", cosfly.maps.stage.run, seed=seed, follow_links=cfg.follow_links),
@@ -74,17 +74,17 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[Sta
         stage("render", cosfly.render.stage.run, boxes, simplified, traces, others=others, seed=seed, **pool),
         stage("inspect", cosfly.inspection.stage.run, simplified, traces, tree, **pool),
         stage("caption", caption.stage.stage.run, tree, seed=seed, **pool),
-        joint_release(cfg, sources, out, resume),
+        joint_release(cfg, sources, out),
     ]
 
 
-def joint_release(cfg: RunConfig, sources: list[Source], out: Path, resume: Resume) -> Stage:
+def joint_release(cfg: RunConfig, sources: list[Source], out: Path) -> Stage:
     """Return the stage that releases one or more runs together."""
-    options: dict[str, Any] = {"resume": resume, **worker_options(cfg)}
+    options = worker_options(cfg)
     return Stage("release", partial(release.build.stage.run, cfg.release, sources, out / "release", **options))
 
 
-def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "release") -> list[StageResult]:
+def run(cfg: RunConfig, out: Path, *, until: str = "release") -> list[StageResult]:
     """Make a data set: read what the configuration names, write one folder per stage below `out`.
 
     With several towns each town has its own run directory below `out`, and one `release` is made of all. Every stage is
@@ -97,16 +97,16 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "
     if until == "release":
         check(cfg)
     if not towns:
-        return _run_town(cfg, out, stages(cfg, out, resume=resume)[:num_stages])
+        return _run_town(cfg, out, stages(cfg, out)[:num_stages])
     with _run_directory(cfg, out):
         results = []
         for number, (name, town) in enumerate(towns.items(), 1):
             log.info("town %d of %d: %s", number, len(towns), name)
-            town_stages = stages(town, out / name, resume=resume)[:-1]  # the release is made of all towns
+            town_stages = stages(town, out / name)[:-1]  # the release is made of all towns
             for result in _run_town(town, out / name, town_stages[:num_stages]):
                 results.append(replace(result, stage=replace(result.stage, name=f"{name}/{result.stage.name}")))
         if until == "release":
-            joint = joint_release(cfg, [Source.of_run(out / name) for name in towns], out, resume)
+            joint = joint_release(cfg, [Source.of_run(out / name) for name in towns], out)
             results.append(_run_stage(joint, out, "all towns"))
     return results
 

@@ -32,7 +32,7 @@ from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, read_object, write_json
 from cosfly.runtime.pool import Watch, run_items
-from cosfly.runtime.run_dir import Resume, StageFolder, read_manifest, result_of
+from cosfly.runtime.run_dir import StageFolder, read_manifest, result_of
 from cosfly.runtime.worker import Item, Outcome, Work
 from cosfly.viz.tables import TextTable, cells
 
@@ -274,7 +274,7 @@ def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int) -> Work:
 
 def run(
     cfg: CompareConfig, simplified_map: Path, paths: Path, out: Path, *, seed: int = 0, workers: int = 0,
-    watch: Watch = Watch(), resume: Resume = "if-same",
+    watch: Watch = Watch(),
 ) -> Path:  # fmt: skip
     """Read a simplified map and `path.json`; write `compare.json`, each planner's traces and a picture.
 
@@ -284,7 +284,7 @@ def run(
     """
     product = out / "compare.json"
     inputs = {"map": simplified_map, "paths": paths}
-    stage = StageFolder.open(out, "plan_compare", config=cfg, inputs=inputs, seed=seed, resume=resume)
+    stage = StageFolder.open(out, "plan_compare", config=cfg, inputs=inputs, seed=seed)
     if stage.is_complete:
         return product
     box_map, pedestrians = read_inputs(simplified_map, paths)

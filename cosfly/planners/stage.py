@@ -26,7 +26,7 @@ from cosfly.planners.contract import PlanConfig, Scenario, load_planner
 from cosfly.runtime.errors import InputError, NoPathError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.pool import Watch, run_items
-from cosfly.runtime.run_dir import Failed, Resume, StageFolder
+from cosfly.runtime.run_dir import Failed, StageFolder
 from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.worker import Item, Outcome, Work
 
@@ -290,7 +290,7 @@ def make_items(pedestrians: Sequence[PedestrianTrajectory], cfg: PlanConfig, see
 
 def run(
     cfg: PlanConfig, simplified_map: Path, paths: Path, out: Path, *, seed: int = 0, workers: int = 0,
-    watch: Watch = Watch(), resume: Resume = "if-same",
+    watch: Watch = Watch(),
 ) -> Path:  # fmt: skip
     """Read a simplified map and `path.json`; write `drone_trace.json` and `plan.png`.
 
@@ -300,7 +300,7 @@ def run(
     from cosfly.planners.overview import draw_trajectories
 
     inputs = {"map": simplified_map, "paths": paths}
-    stage = StageFolder.open(out, "plan", config=cfg, inputs=inputs, seed=seed, resume=resume)
+    stage = StageFolder.open(out, "plan", config=cfg, inputs=inputs, seed=seed)
     product = out / "drone_trace.json"
     picture = out / "plan.png"
     if stage.is_complete:

@@ -32,7 +32,7 @@ from cosfly.runtime.io import CHECKSUMS, atomic_folder, inside, sha256_bytes
 from cosfly.runtime.json_io import dump_json, write_json
 from cosfly.runtime.limits import num_cpus
 from cosfly.runtime.pool import Watch, run_items
-from cosfly.runtime.run_dir import Kept, Resume, StageFolder, Tally, checked_inputs, fingerprint, result_of
+from cosfly.runtime.run_dir import Kept, StageFolder, Tally, checked_inputs, fingerprint, result_of
 from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.worker import Item, Outcome, Work
 
@@ -149,7 +149,6 @@ def run(
     seed: int = 0,
     workers: int = 0,
     watch: Watch = Watch(),
-    resume: Resume = "if-same",
     others: Path | None = None,
 ) -> Path:
     """Read the maps `boxes_3d.json` (drawn) and `step2_simplified.json` (clearance), `drone_trace.json` and, with
@@ -167,7 +166,7 @@ def run(
         problem = "the input has no drone trajectory with this index"
         expected = f"an index from 0 to {num - 1}"
         raise ConfigError(problem, where="render.path_index", got=cfg.path_index, expected=expected)
-    stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed, resume=resume)
+    stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed)
     if stage.is_complete:
         return out
     check_ground(box_map, boxes)

@@ -61,8 +61,6 @@ BEGUN = ("stage.json", "items.jsonl", "failures.jsonl", EVENTS)  # present befor
 ROLES = {"maps": "boxes", "map": "simplified"}  # input names of some stages -> the name of that product in others
 NUM_NAMED = 5  # most files that an error lists
 
-Resume = Literal["never", "if-same"]
-
 
 # --- the lock ---------------------------------------------------------------------------------------------------------
 
@@ -273,17 +271,15 @@ class StageFolder:
         config: Config,
         inputs: dict[str, Path],
         seed: int,
-        resume: Resume = "if-same",
         package_files: Mapping[str, Path] = MappingProxyType({}),
         audited: Collection[str] = (),
         begun: Collection[str] = (),
         retries: bool = True,
     ) -> StageFolder:
-        """Start or resume a stage.
+        """Start a stage, or resume it if its settings, inputs and seed are the same.
 
         Args:
             inputs: Name -> file or folder that the stage reads.
-            resume: `never` refuses a folder that holds work; `if-same` requires equal settings, inputs and seed.
             package_files: Name -> file or flat folder of the package that determines the products.
             audited: Names of inputs that the stage itself compares with their records, item by item.
             begun: Files and folders that this stage writes before any item is finished, in addition to BEGUN.
@@ -301,7 +297,7 @@ class StageFolder:
             raise StorageError("the output path is a file, not a folder", where=out, fix="choose another --out")
         if (out / "manifest.json").exists():
             manifest = read_manifest(out)
-            _check_same(out, record, resume)
+            _check_same(out, record)
             if not (retries and manifest.counts.failed):
                 _check_outputs_exist(out, manifest)
                 # A kill has left the lock file, unless it is held or the disk is read-only.
@@ -312,7 +308,7 @@ class StageFolder:
                 return cls(out, stage, True)
         lock = hold_folder(out)
         try:
-            _prepare_resume(out, record, resume, (*BEGUN, *begun))
+            _prepare_resume(out, record, (*BEGUN, *begun))
             # Failed items are tried again; the others are in the journal.
             (out / "manifest.json").unlink(missing_ok=True)
             write_model(out / "stage.json", record, STAGE_FORMAT)
@@ -376,7 +372,7 @@ class StageFolder:
         return NothingKept(what, where=where or self.path, got=got, expected=expected, fix=fix)
 
 
-def _prepare_resume(out: Path, record: StageRecord, resume: Resume, begun: Collection[str]) -> None:
+def _prepare_resume(out: Path, record: StageRecord, begun: Collection[str]) -> None:
     """Prepare a folder for new work or a resume; raises ResumeError if it holds other work or foreign files."""
     if not (out / "stage.json").exists():
         # A kill during the write of the record leaves its partial file.
@@ -384,7 +380,7 @@ def _prepare_resume(out: Path, record: StageRecord, resume: Resume, begun: Colle
             problem = "the output directory contains files that cosfly did not write"
             raise ResumeError(problem, where=out, fix="choose an empty --out")
     elif _holds_work(out, begun):
-        _check_same(out, record, resume)
+        _check_same(out, record)
     else:
         # An attempt that finished nothing may be repeated with other settings. Its stage.json stays until the new one
         # is written: without it, the other files would look foreign after a kill.
@@ -404,15 +400,9 @@ def _holds_work(out: Path, begun: Collection[str]) -> bool:
     return False
 
 
-def _check_same(out: Path, record: StageRecord, resume: Resume) -> None:
+def _check_same(out: Path, record: StageRecord) -> None:
     """Raise ResumeError if `record` does not agree with the record of the work in a folder."""
     previous = read_stage_record(out)
-    if resume == "never":
-        raise ResumeError(
-            "the folder already contains results of an earlier command",
-            where=out,
-            fix="choose another --out, or add --resume if-same to continue the earlier command",
-        )
     before = flattened(previous.config) | {"seed": previous.seed}
     after = flattened(record.config) | {"seed": record.seed}
     differences = [

@@ -11,7 +11,7 @@ from cosfly.geometry.grid import blocks_walking, compare, connected_parts, empty
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, write_json
-from cosfly.runtime.run_dir import Resume, StageFolder, Tally
+from cosfly.runtime.run_dir import StageFolder, Tally
 from cosfly.simplify.passes import Simplification, SimplifyConfig, simplify
 from cosfly.viz.topview import TopView, add_caption, draw_map, png_bytes
 
@@ -70,9 +70,9 @@ def report(raw: BoxMap, result: Simplification, cfg: SimplifyConfig) -> dict:
     }  # fmt: skip
 
 
-def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same") -> Path:
+def run(cfg: SimplifyConfig, maps: Path, out: Path) -> Path:
     """Read `boxes_3d.json`; write `step2_simplified.json`, `simplify_report.json` and `simplify.png`."""
-    stage = StageFolder.open(out, "simplify", config=cfg, inputs={"maps": maps}, seed=0, resume=resume)
+    stage = StageFolder.open(out, "simplify", config=cfg, inputs={"maps": maps}, seed=0)
     product = out / "step2_simplified.json"
     if stage.is_complete:
         return product

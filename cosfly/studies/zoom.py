@@ -57,7 +57,7 @@ def run(
 
     Args:
         every: Every how many poses of a track are drawn.
-        options: `seed`, `workers`, `watch` and `resume` of the render stage.
+        options: `seed`, `workers` and `watch` of the render stage.
     """
 
     def draw(fov_deg: float, path_index: int | None = None) -> list[Track]:

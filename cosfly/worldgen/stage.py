@@ -23,7 +23,7 @@ from cosfly.runtime.errors import InputError, TeacherError
 from cosfly.runtime.io import sha256_bytes, write_bytes
 from cosfly.runtime.json_io import FileFormat, validated, write_json, write_model
 from cosfly.runtime.model_json import find_object
-from cosfly.runtime.run_dir import Resume, StageFolder, Tally, hold_folder
+from cosfly.runtime.run_dir import StageFolder, Tally, hold_folder
 from cosfly.viz.topview import HALO, TopView, draw_map, draw_text, png_bytes
 from cosfly.worldgen.plan import OBJECTS, PLAN_FORMAT, WorldPlan, assets
 from cosfly.worldgen.rules import plan_by_rules
@@ -146,7 +146,7 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
     return plan, trace | {"not_used": plan.not_used}
 
 
-def run(cfg: WorldConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
+def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     """Read a prompt; write trace.json, plan.json, layout.json, placement.json, combined_world.json with Bbox.json,
     checks.json, map.png, and loop.yaml: settings for `cosfly run` on the world.
     """
@@ -155,7 +155,7 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same
         expected = f"1 to {MOST_CHARACTERS} characters, such as 'a small village with a church'"
         got = f"{len(prompt)} characters"
         raise InputError("the prompt is empty or too long", where="PROMPT", got=got, expected=expected)
-    stage = StageFolder.open(out, "world", config=cfg, inputs={}, seed=seed, resume=resume)
+    stage = StageFolder.open(out, "world", config=cfg, inputs={}, seed=seed)
     product = out / WORLD_FILE
     if stage.is_complete:
         return product

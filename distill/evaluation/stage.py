@@ -20,7 +20,7 @@ from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import write_model
-from cosfly.runtime.run_dir import Resume, StageFolder, Tally, read_manifest
+from cosfly.runtime.run_dir import StageFolder, Tally, read_manifest
 from cosfly.runtime.seeding import rng_for
 from distill.evaluation.figures import TEACHER, Answers, Measurement, coc_of, decision_number, measure, text_of
 from distill.evaluation.report import REPORT, REPORT_FORMAT, Evaluation, Example, Metric, StudentRecord, page_of
@@ -46,7 +46,6 @@ def run(
     encoders: Mapping[Language, Path] | None = None,
     judged: Sequence[Path] = (),
     seed: int = 0,
-    resume: Resume = "if-same",
 ) -> Path:
     """Read the predictions of students and their training set; write `report.json` and a page.
 
@@ -73,7 +72,7 @@ def run(
         inputs[f"predictions/{n}_{name.replace('.', '_')}"] = path
     for language, folder in encoders.items():
         inputs |= {f"bertscore/{language}/{path.name}": path for path in encoder_files(folder)}
-    stage = StageFolder.open(out, STAGE, config=Config(), inputs=inputs, seed=seed, resume=resume)
+    stage = StageFolder.open(out, STAGE, config=Config(), inputs=inputs, seed=seed)
     if stage.is_complete:
         return out / REPORT
     found = {name: {p.key: p for p in read_predictions(path)} for name, path in files.items()}

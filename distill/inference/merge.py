@@ -6,14 +6,14 @@ from pathlib import Path
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE
 from cosfly.runtime.config import Config
 from cosfly.runtime.io import atomic_folder
-from cosfly.runtime.run_dir import Resume, StageFolder, Tally
+from cosfly.runtime.run_dir import StageFolder, Tally
 from distill.student.model import load_student, loading_errors, student_path, weight_files
 from distill.student.saving import check_adapter, write_student
 
 STAGE = "distill.merge"
 
 
-def run(model: Path, adapter: Path, out: Path, *, resume: Resume = "if-same") -> Path:
+def run(model: Path, adapter: Path, out: Path) -> Path:
     """Read a base model and an adapter that was trained on it; write `model/`.
 
     peft adds the update in float32, and each weight is rounded once to the type of the base.
@@ -27,7 +27,7 @@ def run(model: Path, adapter: Path, out: Path, *, resume: Resume = "if-same") ->
     """
     model = student_path(str(model))
     inputs = {**weight_files(model), **check_adapter(adapter, model)}
-    stage = StageFolder.open(out, STAGE, config=Config(), inputs=inputs, seed=0, resume=resume)
+    stage = StageFolder.open(out, STAGE, config=Config(), inputs=inputs, seed=0)
     merged = out / "model"
     if stage.is_complete:
         return merged

@@ -20,7 +20,7 @@ from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import ConfigError, InputError, TeacherError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import dump_json
-from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, read_manifest, read_stage_record, write_failures
+from cosfly.runtime.run_dir import Failed, StageFolder, Tally, read_manifest, read_stage_record, write_failures
 from distill.inference.answers import EngineAnswers, LocalAnswers
 from distill.inference.samples import STAGE, InferConfig, Inputs, SampleOutcome
 from distill.schema import open_split, resolve_trees, tree_inputs
@@ -60,7 +60,6 @@ def run(
     out: Path,
     *,
     adapter: Path | None = None,
-    resume: Resume = "if-same",
 ) -> Path:
     """Read a split, its playback trees `data`, the model and (if given) its adapter; write `predictions.jsonl`.
 
@@ -93,7 +92,7 @@ def run(
         files |= weight_files(model)
     if adapter is not None:
         files |= check_adapter(adapter, Path(model))
-    stage = StageFolder.open(out, STAGE, config=cfg, inputs=files, seed=0, resume=resume)
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=files, seed=0)
     if stage.is_complete:
         return out / PREDICTIONS
     samples = open_split(dataset, cfg.split)[: cfg.max_samples or None]

@@ -20,7 +20,7 @@ from cosfly.geometry.axes import step_s
 from cosfly.geometry.splits import SPLITS, Course, walks_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError, VerifyError
-from cosfly.runtime.run_dir import Dropped, Failed, Resume, StageFolder, Tally, fingerprint, write_failures
+from cosfly.runtime.run_dir import Dropped, Failed, StageFolder, Tally, fingerprint, write_failures
 from distill.prepare.stage import SplitConfig, check_names, run_of, track_key
 from distill.schema import SourceTree, SplitMember, tree_inputs, write_page, write_splits
 
@@ -76,7 +76,7 @@ class DualTrackConfig(SplitConfig):
         return self.observed + self.predicted
 
 
-def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
+def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0) -> Path:
     """Read playback trees; write windows by split into `out`, which is returned.
 
     A perturbed track of N frames with a clean one gives (N - length) // stride + 1 windows. Tracks that cannot be read
@@ -88,7 +88,7 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
     """
     check_names([run_of(tree) for tree in trees])
     runs = {run_of(tree): tree for tree in trees}
-    stage = StageFolder.open(out, STAGE, config=cfg, inputs=tree_inputs(runs.values()), seed=seed, resume=resume)
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=tree_inputs(runs.values()), seed=seed)
     if stage.is_complete:
         return out
     folders = {place_of(folder, run): folder for run, tree in runs.items() for folder in find_tracks(tree)}

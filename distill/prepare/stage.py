@@ -33,7 +33,7 @@ from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import check_stays_below, inside
 from cosfly.runtime.json_io import dump_json, write_model
-from cosfly.runtime.run_dir import Resume, StageFolder, Tally, fingerprint, record_of
+from cosfly.runtime.run_dir import StageFolder, Tally, fingerprint, record_of
 from cosfly.viz.frame_views import DEPTH_RANGE_M, VIEW_FILES, Pictures, View, scaled_size
 from distill.schema import RECORD, RECORD_FORMAT, Sample, SourceTree, TrainingSet, tree_inputs, write_page, write_splits
 
@@ -242,9 +242,7 @@ class _Tracks:
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
-def run(
-    cfg: PrepareConfig, sources: Sequence[RunSource], out: Path, *, seed: int = 0, resume: Resume = "if-same"
-) -> Path:
+def run(cfg: PrepareConfig, sources: Sequence[RunSource], out: Path, *, seed: int = 0) -> Path:
     """Read the captions and playback trees of some runs; write a training set (distill/schema.py) into `out`.
 
     Returns:
@@ -254,7 +252,7 @@ def run(
         NothingKept: no caption can be used. VerifyError: captions are of another tree.
     """
     inputs = tree_inputs([source.data for source in sources], [source.captions for source in sources])
-    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed)
     if stage.is_complete:
         return out
     check_names([source.run for source in sources])

@@ -17,7 +17,7 @@ from typing import Any
 from cosfly.llm.student_chat import ChatFormat, FrameFormat, write_chat_format
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
 from cosfly.runtime.io import atomic_folder, read_text
-from cosfly.runtime.run_dir import Resume, StageFolder, Tally
+from cosfly.runtime.run_dir import StageFolder, Tally
 from cosfly.runtime.seeding import rng_for
 from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
 from distill.student.chat import check_template
@@ -181,7 +181,6 @@ def run(
     out: Path,
     *,
     seed: int = 0,
-    resume: Resume = "if-same",
 ) -> Path:
     """Read a training set, its playback trees and a student; write `adapter/` or `model/`, `log.jsonl`, `checkpoints/`.
 
@@ -213,7 +212,7 @@ def run(
             base, cfg = out / STUDENT, cfg.model_copy(update={"random_student": random_student})
         folder: StageFolder | None = None
         if accelerator.is_main_process:  # its error ends all
-            given: Any = {"config": cfg, "inputs": inputs, "seed": seed, "resume": resume}
+            given: Any = {"config": cfg, "inputs": inputs, "seed": seed}
             folder = StageFolder.open(out, STAGE, **given, begun=(LOG, STUDENT))
             if random_student and not folder.is_complete and not base.exists():
                 samples = open_split(dataset, "train")

@@ -24,7 +24,6 @@ from cosfly.runtime.json_io import dump_json, parse_json
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import (
     Failed,
-    Resume,
     StageFolder,
     StageInput,
     StageRecord,
@@ -266,7 +265,6 @@ def run(
     *,
     workers: int = 0,
     watch: Watch = Watch(),
-    resume: Resume = "if-same",
 ) -> Path:
     """Read the playback tree, the captions and, where there is one, the inspection of each run; write `dataset/` and
     return its path.
@@ -280,7 +278,7 @@ def run(
     inputs = {
         name: source.files[role] for source, roles in zip(sources, names, strict=True) for role, name in roles.items()
     }
-    stage = StageFolder.open(out, "release", config=cfg, inputs=inputs, seed=0, resume=resume)
+    stage = StageFolder.open(out, "release", config=cfg, inputs=inputs, seed=0)
     dataset, parts = out / DATASET, out / PARTS
     if stage.is_complete:
         shutil.rmtree(parts, ignore_errors=True)

@@ -33,7 +33,7 @@ from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.io import CHECKSUMS, atomic_folder, sha256_file, write_bytes, write_checksums
 from cosfly.runtime.png import png_size
-from cosfly.runtime.run_dir import Resume, StageFolder, Tally
+from cosfly.runtime.run_dir import StageFolder, Tally
 from cosfly.viz.page import markdown
 from release.columns import LANGUAGES, PICTURES, PLACE, SPLIT_NAMES, SplitName
 from release.reading import Pictures, Row, read_pictures, read_tracks
@@ -279,13 +279,11 @@ def _write_checksums(folder: Path) -> None:
         write_checksums(folder, {path.relative_to(folder).as_posix(): digest for path, digest in digests})
 
 
-def run(cfg: ExportConfig, folder: Path, out: Path, *, resume: Resume = "if-same") -> Path:
+def run(cfg: ExportConfig, folder: Path, out: Path) -> Path:
     """Read a release, also of a run; write it in the format of the settings and return its folder."""
     is_of_windows = EXPORTS[cfg.format].needs_consecutive and (cfg.frames == "all" or cfg.format == "lerobot")
     source = check_needs(open_release(folder, f"the {cfg.format} export" if is_of_windows else ""), cfg)
-    stage = StageFolder.open(
-        out, "export", config=cfg, inputs={"release": source.folder / RECORD}, seed=0, resume=resume
-    )
+    stage = StageFolder.open(out, "export", config=cfg, inputs={"release": source.folder / RECORD}, seed=0)
     product, num_frames = out / cfg.format, source.record.numbers.frames
     if stage.is_complete:
         return product
