@@ -12,12 +12,10 @@ import numpy as np
 
 from cosfly.formats.frames import DEPTH_NPY, INVALID_DEPTH_M, SHARED_ID, SKY_DEPTH_M, depth_values, public_name
 from cosfly.formats.kinds import KINDS
-from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.png import colours_of
 
 NO_DEPTH = np.empty((0, 0), np.float32)
-NO_DEPTH.flags.writeable = False
 NO_IDS = np.empty((0, 0, 3), np.uint8)
 NUM_IDS = 1 << 16
 PERSON, NOTHING, SKY = KINDS["Pedestrians"], KINDS["NONE"], KINDS["Sky"]
@@ -64,7 +62,6 @@ def unpack(files: dict[str, bytes], where: Path) -> Picture:
     if depth_name is not None:
         depth = depth_values(memoryview(files[depth_name]), where / depth_name)
         _check_size(depth, colours, where / depth_name)
-    depth.flags.writeable = False  # the kernels are compiled for read-only arrays only
     return Picture(colours, depth, instance)
 
 
@@ -87,159 +84,102 @@ def measure_pixels(picture: Picture, is_bystander: np.ndarray, flat_share: float
         flat_share: A surface of one colour has at least this share of equal neighbours.
     """
     num_pixels = picture.colours.shape[0] * picture.colours.shape[1]
+    red, green, blue = np.moveaxis(picture.colours, 2, 0)
+    magenta = (red >= MAGENTA_LEAST) & (blue >= MAGENTA_LEAST) & (green <= MAGENTA_MOST)
     if not picture.instance.size:
-        red, green, blue = (picture.colours[..., k] for k in range(3))
-        magenta = (red >= MAGENTA_LEAST) & (blue >= MAGENTA_LEAST) & (green <= MAGENTA_MOST)
         return PixelFigures(flat=0.0, flat_kind=0, magenta=float(magenta.mean()), fighting=0.0, person_box=None)
-    all_pairs, all_equal, all_bright, kinds, num_magenta, num_fighting, box = _measure(
-        picture.colours, picture.instance, picture.depth, is_bystander
-    )
-    ids = np.unique(np.append(np.flatnonzero(all_pairs), 0))  # those in the picture, and 0, so that there is one
-    pairs = all_pairs[ids]
-    equal = all_equal[ids]
-    is_flat = (pairs >= LEAST_PAIRS) & (equal >= flat_share * pairs) & (all_bright[ids] >= DARK * pairs)
-    largest = int(np.argmax(np.where(is_flat, pairs, 0)))
-    # A renderer whose other surfaces have no grain either draws without textures, so none is missing.
-    other_equal = int(equal.sum() - equal[largest])
-    other_pairs = int(pairs.sum() - pairs[largest])
-    lacks_texture = bool(is_flat[largest]) and other_equal < GRAINLESS * other_pairs
+    kinds = picture.instance[..., 0]
+    ids = picture.instance[..., 1].astype(np.uint16) | picture.instance[..., 2].astype(np.uint16) << 8
+    codes = kinds | ids.astype(np.int32) << 8
+    is_surface = (kinds != NOTHING) & (kinds != SKY)
+    flat_id, num_pairs = _flat_surface(picture.colours, codes, is_surface, flat_share)
+    num_fighting = 0
+    if picture.depth.size:
+        num_fighting = _num_fighting(codes, picture.depth, picture.colours)
+        num_fighting += _num_fighting(codes.T, picture.depth.T, picture.colours.transpose(1, 0, 2))
     return PixelFigures(
-        flat=float(pairs[largest]) / num_pixels if lacks_texture else 0.0,
-        flat_kind=int(kinds[ids[largest]]),
-        magenta=num_magenta / num_pixels,
+        flat=num_pairs / num_pixels,
+        flat_kind=int(kinds[ids == flat_id][-1]) if num_pairs else 0,
+        magenta=float((magenta & is_surface).sum()) / num_pixels,
         fighting=num_fighting / num_pixels,
-        person_box=None if box[2] < 0 else (int(box[0]), int(box[1]), int(box[2]), int(box[3])),
+        person_box=_box_of((kinds == PERSON) & ~is_bystander[ids]),
     )
 
 
-@njit(cache=True, nogil=True)
-def _fights(colours, instance, depth, code, other, begins, line, down):  # type: ignore[no-untyped-def]
-    """Return whether two surfaces that alternate along a line lie in one plane and differ visibly.
+def _flat_surface(colours: np.ndarray, codes: np.ndarray, is_surface: np.ndarray, flat_share: float) -> tuple[int, int]:
+    """Return the id of the largest surface without texture, and its number of pixel pairs; 0 pairs if there is none.
+
+    A pair is two neighbours of one surface in a row. A renderer whose other surfaces have no grain either draws without
+    textures, so none is missing.
+    """
+    red, green, blue = np.moveaxis(colours.astype(np.int32), 2, 0)
+    shades = red | green << 8 | blue << 16
+    is_pair = is_surface[:, :-1] & (codes[:, :-1] == codes[:, 1:])
+    is_equal = is_pair & (shades[:, :-1] == shades[:, 1:])
+    # Sums over stretches of one id come first: they are few.
+    ids = (codes[:, :-1] >> 8).ravel()
+    starts = np.append(0, np.flatnonzero(ids[1:] != ids[:-1]) + 1)
+    pairs, equal = (
+        np.bincount(ids[starts], np.add.reduceat(flags.ravel(), starts, dtype=np.int64))
+        for flags in (is_pair, is_equal)
+    )
+    is_flat = (pairs >= LEAST_PAIRS) & (equal >= flat_share * pairs)
+    for largest in sorted(np.flatnonzero(is_flat).tolist(), key=lambda k: -pairs[k]):
+        if green[:, :-1][is_pair & (codes[:, :-1] >> 8 == largest)].mean() >= DARK:
+            others_have_grain = equal.sum() - equal[largest] < GRAINLESS * (pairs.sum() - pairs[largest])
+            return largest, int(pairs[largest]) if others_have_grain else 0
+    return 0, 0
+
+
+def _num_fighting(codes: np.ndarray, depth: np.ndarray, colours: np.ndarray) -> int:
+    """Return the number of pixels at which two surfaces of one plane alternate along the rows and differ visibly.
+
+    Surfaces alternate where four runs of equal pixels in a row are A | B | A | B and those in the middle are short:
+
+        A | B | A | B
+            low     end: the first pixels of the second and of the last run
+                middle: that of the third
 
     Args:
-        code, other: Id << 8 | kind of each surface.
-        begins: First pixels of the last three runs, of which the first two must be short.
-        line: Index of the row, or of the column if `down` is 1.
+        codes: (h, w) int32, id << 8 | kind.
     """
-    low, middle, end = begins
-    if end - middle > SHORTEST_RUN_PX or middle - low > SHORTEST_RUN_PX:
-        return False
+    rows, ends = np.nonzero(codes[:, 1:] != codes[:, :-1])  # the first pixels of all runs but the first of a row
+    starts = ends + 1
+    low, middle, end = starts[:-2], starts[1:-1], starts[2:]
+    is_short = (rows[2:] == rows[:-2]) & (end - middle <= SHORTEST_RUN_PX) & (middle - low <= SHORTEST_RUN_PX)
+    rows, low, middle, end = rows[2:][is_short], low[is_short], middle[is_short], end[is_short]
+    first, second = codes[rows, low - 1], codes[rows, low]
+    alternates = (first == codes[rows, middle]) & (second == codes[rows, end])
     # Distant fields are narrow stripes without an id.
-    if code >> 8 == SHARED_ID or other >> 8 == SHARED_ID or (code | other) >> 8 == 0:
-        return False
-    across = 1 - down
-    # The first pixel of the line.
-    y = across * line
-    x = down * line
-    before = low - 1
-    first_m = float(depth[y + down * before, x + across * before])
-    last_m = float(depth[y + down * end, x + across * end])
-    if not (INVALID_DEPTH_M < first_m < SKY_DEPTH_M and INVALID_DEPTH_M < last_m < SKY_DEPTH_M):
-        return False
-    first = 1.0 / first_m
-    last = 1.0 / last_m
-    for k in range(low, end):
-        depth_m = float(depth[y + down * k, x + across * k])
-        plane = first + (last - first) * (k - before) / (end - before)
-        if not depth_m > 0.0 or abs(1.0 / depth_m - plane) > PLANE_SHARE * plane:
-            return False
+    has_ids = (first >> 8 != SHARED_ID) & (second >> 8 != SHARED_ID) & ((first | second) >> 8 != 0)
+    chosen = alternates & has_ids
+    rows, low, middle, end = rows[chosen], low[chosen], middle[chosen], end[chosen]
+    fights = _lie_in_plane(depth, rows, low, end)
     for k in (middle, end):
-        y0 = y + down * (k - 1)
-        x0 = x + across * (k - 1)
-        y1 = y + down * k
-        x1 = x + across * k
-        step = np.int64(0)
-        for channel in range(3):
-            step += abs(np.int64(colours[y0, x0, channel]) - np.int64(colours[y1, x1, channel]))
-        if instance[y0, x0, 0] == instance[y1, x1, 0] and step <= VISIBLE_STEP:
-            return False
-    return True
+        step = np.abs(colours[rows, k].astype(int) - colours[rows, k - 1]).sum(axis=1)
+        kind_changes = (codes[rows, k] ^ codes[rows, k - 1]) & 255 != 0
+        fights &= kind_changes | (step > VISIBLE_STEP)
+    return int((end - middle)[fights].sum())
 
 
-@njit(cache=True, nogil=True)
-def _pack(instance, colours, codes, shades):  # type: ignore[no-untyped-def]
-    """Pack the pixels of a row, (w, 3) uint8 each: id << 8 | kind into `codes`, blue, green, red into `shades`."""
-    for x in range(np.uint64(len(instance))):  # an unsigned index avoids numba's wraparound checks
-        codes[x] = np.int32(instance[x, 0]) | np.int32(instance[x, 1]) << 8 | np.int32(instance[x, 2]) << 16
-        shades[x] = np.uint32(colours[x, 0]) | np.uint32(colours[x, 1]) << 8 | np.uint32(colours[x, 2]) << 16
+def _lie_in_plane(depth: np.ndarray, rows: np.ndarray, low: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return whether the pixels from low - 1 to end of a row lie in one plane, (n,) bool."""
+    before_m, last_m = depth[rows, low - 1], depth[rows, end]
+    is_valid = (before_m > INVALID_DEPTH_M) & (before_m < SKY_DEPTH_M)
+    is_valid &= (last_m > INVALID_DEPTH_M) & (last_m < SKY_DEPTH_M)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        before, last = 1.0 / before_m.astype(float), 1.0 / last_m.astype(float)
+        for k in range(2 * SHORTEST_RUN_PX):
+            at = np.minimum(low + k, end)
+            plane = before + (last - before) * (at - low + 1) / (end - low + 1)
+            depth_m = depth[rows, at].astype(float)
+            is_valid &= (depth_m > 0.0) & (np.abs(1.0 / depth_m - plane) <= PLANE_SHARE * plane)
+    return is_valid
 
 
-@njit(cache=True, nogil=True)
-def _measure(colours, instance, depth, is_bystander):  # type: ignore[no-untyped-def]
-    """Measure a frame run by run: a run is a stretch of pixels of one id and kind in a row.
-
-    Returns:
-        By id, (65536,) each: pairs of neighbours in a row, pairs of one colour, sum of green, kind. Then the counts of
-        magenta and of fighting pixels, and the box of the pedestrians that are no bystanders.
-    """
-    height, width = instance.shape[:2]
-    has_depth = depth.shape[0] > 0
-    pairs = np.zeros(NUM_IDS, np.int64)
-    equal = np.zeros(NUM_IDS, np.int64)
-    bright = np.zeros(NUM_IDS, np.int64)
-    kinds = np.zeros(NUM_IDS, np.uint8)
-    num_magenta = np.int64(0)
-    num_fighting = np.int64(0)
-    box = np.array([1 << 30, 1 << 30, -1, -1], np.int64)
-    # Code and first row of the current run of each column, and of the two runs before it.
-    column_codes = np.full((3, width), -1, np.int32)
-    column_firsts = np.zeros((3, width), np.int32)
-    codes = np.full(width + 1, -1, np.int32)  # of the present row; -1 follows it
-    shades = np.empty(width, np.uint32)
-    one = np.uint64(1)  # numba keeps an index unsigned only if all operands are
-    size = np.uint64(width)
-    byte = np.uint32(255)
-    for y in range(height):
-        _pack(instance[y], colours[y], codes, shades)
-        first = np.uint64(0)
-        # Codes of the three previous runs of this row, the latest first, and first pixels of the last two.
-        code1, code2, code3 = np.int64(-1), np.int64(-1), np.int64(-1)
-        first1, first2 = np.int64(0), np.int64(0)
-        while first < size:
-            code = np.int64(codes[first])
-            end = first + one
-            while codes[end] == code:
-                end += one
-            begin = np.int64(first)
-            kind = code & 255
-            number = code >> 8
-            if kind == PERSON and not is_bystander[number]:
-                box[0], box[1] = min(box[0], begin), min(box[1], y)
-                box[2], box[3] = max(box[2], np.int64(end)), max(box[3], y + 1)
-            if kind not in (NOTHING, SKY):
-                kinds[number] = kind
-                num_equal, sum_green, num_pink = np.uint32(0), np.uint32(0), np.uint32(0)
-                for x in range(first, end - one):
-                    shade = shades[x]
-                    red, green, blue = shade & byte, shade >> np.uint32(8) & byte, shade >> np.uint32(16)
-                    num_equal += np.uint32(shade == shades[x + one])
-                    sum_green += green
-                    num_pink += np.uint32((red >= MAGENTA_LEAST) & (blue >= MAGENTA_LEAST) & (green <= MAGENTA_MOST))
-                pairs[number] += np.int64(end) - 1 - begin
-                equal[number] += num_equal
-                bright[number] += sum_green
-                num_magenta += np.int64(num_pink)
-            if has_depth:
-                # Runs 3, 2, 1 and this one: A, B, A, B, with short ones in the middle.
-                begins = (first2, first1, begin)
-                if code == code2 and code1 == code3 and _fights(colours, instance, depth, code, code1, begins, y, 0):
-                    num_fighting += begin - first1
-                code3, code2, code1 = code2, code1, code
-                first2, first1 = first1, begin
-            first = end
-        if has_depth:
-            for index in range(size):
-                if column_codes[0, index] != codes[index]:
-                    column = np.int64(index)
-                    code = np.int64(codes[index])
-                    other = np.int64(column_codes[0, column])
-                    begins = (np.int64(column_firsts[1, column]), np.int64(column_firsts[0, column]), np.int64(y))
-                    alternates = code == column_codes[1, column] and other == column_codes[2, column]
-                    if alternates and _fights(colours, instance, depth, code, other, begins, column, 1):
-                        num_fighting += y - begins[1]
-                    for age in (2, 1):
-                        column_codes[age, column] = column_codes[age - 1, column]
-                        column_firsts[age, column] = column_firsts[age - 1, column]
-                    column_codes[0, column] = code
-                    column_firsts[0, column] = y
-    return pairs, equal, bright, kinds, num_magenta, num_fighting, box
+def _box_of(mask: np.ndarray) -> tuple[int, int, int, int] | None:
+    """Return xmin, ymin, xmax, ymax of the pixels of a mask; None without any."""
+    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    if not len(rows):
+        return None
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
