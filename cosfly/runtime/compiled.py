@@ -2,7 +2,7 @@
 
 Numba caches a compiled function until its own file changes, even if functions that it calls change. Here each version
 of all compiled sources together has its own cache folder, $XDG_CACHE_HOME/cosfly/<digest>, unless NUMBA_CACHE_DIR is
-set. If several processes need a function, one compiles it and the others wait for the lock of the cache and load it.
+set. Processes that need a function at the same time each compile it.
 
 Two rules keep compiling short. Pass literals as `int64(0)`, because numba treats a literal argument as a type of its
 own and compiles the function once more. Set whole arrays by `fill` or a loop, because `array[:] = ...` also compiles
@@ -14,13 +14,11 @@ import hashlib
 import itertools
 import logging
 import os
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numba
-from filelock import FileLock
 from numba import boolean, int64
 from numba.core import caching
 
@@ -33,27 +31,15 @@ log = logging.getLogger(__name__)
 PACKAGE = Path(__file__).parents[1]
 
 
-class _SharedCache(caching.FunctionCache):
-    """The cache of a function. A process that compiles it holds the lock of the cache until it has saved the result."""
+class _LoggedCache(caching.FunctionCache):
+    """The cache of a function, which logs that it must be compiled."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         overload = super().load_overload(sig, target_context)
         if overload is None:
-            with contextlib.suppress(OSError):  # where no lock can be created, each process compiles
-                _lock.acquire()
-            overload = super().load_overload(sig, target_context)  # another process may have compiled it meanwhile
-            if overload is None:
-                words = "compiling kernels of %s, once on this machine (those of planning take about 30 s), into %s"
-                log.info(words, self._py_func.__module__, self.cache_path)
-            else:
-                _lock.release()
+            words = "compiling kernels of %s, once on this machine (those of planning take about 30 s), into %s"
+            log.info(words, self._py_func.__module__, self.cache_path)
         return overload
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        try:
-            super().save_overload(sig, data)
-        finally:
-            _lock.release()
 
 
 def njit(**options: Any) -> Callable[[Callable], Callable]:
@@ -63,7 +49,7 @@ def njit(**options: Any) -> Callable[[Callable], Callable]:
     def decorate(function: Callable) -> Callable:
         compiled = compile_lazily(function)
         if options.get("cache"):
-            compiled._cache = _SharedCache(function)
+            compiled._cache = _LoggedCache(function)
         return compiled
 
     return decorate
@@ -87,4 +73,3 @@ log.addFilter(lambda record: next(_num_records) == 0)
 
 if "NUMBA_CACHE_DIR" not in os.environ:
     _use_own_cache(Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "cosfly")
-_lock = FileLock(Path(numba.config.CACHE_DIR or tempfile.gettempdir(), "compiling.lock"))  # type: ignore[attr-defined]
