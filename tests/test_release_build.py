@@ -54,10 +54,22 @@ def material(tmp_path_factory) -> Path:
     return make_material(tmp_path_factory.mktemp("material"), 8, ("Town01", "Town02", "Town02_Opt", "Town03"))
 
 
-def make_material(root: Path, num_walks: int, towns: tuple[str, ...] = ("Town01",)) -> Path:
-    tree = make_playback_tree(root / "tree", num_walks, POINTS, width_px=48, height_px=27, towns=towns)
-    flights = map(read_track, find_tracks(tree))
-    write_captions(root / "captions.jsonl", [make_caption(f, i) for f in flights for i in range(4, POINTS - 1)])
+def make_material(
+    root: Path,
+    num_walks: int,
+    towns: tuple[str, ...] = ("Town01",),
+    num_points: int = POINTS,
+    captioned: range = range(4, POINTS - 1),
+    num_future: int = 1,
+) -> Path:
+    """Write tree/, captions.jsonl of some frames of each flight (labels look num_future frames ahead), inspect.json."""
+    tree = make_playback_tree(root / "tree", num_walks, num_points, width_px=48, height_px=27, towns=towns)
+    captions = [
+        make_caption(flight, i, future=list(range(i + 1, i + 1 + num_future)))
+        for flight in map(read_track, find_tracks(tree))
+        for i in captioned
+    ]
+    write_captions(root / "captions.jsonl", captions)
     write_inspection(root / "inspect.json", make_inspection(tree, {}))
     return root
 
@@ -237,7 +249,6 @@ DAMAGES = {
     "two captions of a frame": (lambda r: rewrite_captions(r, lambda c: c.append(c[0])), "two accepted captions"),
     "a caption in one language": (caption(zh=None), "no text in one of the two languages"),
     "a frame that is no number": (caption(frame_index="x"), "frame_index"),
-    "a picture of 2^64 px": (caption(picture_px=[2**64, 54]), r"picture_px\[0\]: .*got 18446744"),
     "captions of another version": (caption(schema_version="1.0"), "the captions is not supported"),
 }  # fmt: skip
 
@@ -290,10 +301,7 @@ def test_after_a_failed_flight_the_finished_shards_are_not_done_again(tmp_path, 
 
 
 def test_windows_keep_the_pictures_of_captions(tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 1, 100, width_px=32, height_px=18)
-    captions = [make_caption(f, i) for f in map(read_track, find_tracks(tree)) for i in range(4, 90)]
-    write_captions(tmp_path / "captions.jsonl", captions)
-    write_inspection(tmp_path / "inspect.json", make_inspection(tree, {}))
+    make_material(tmp_path, 1, num_points=100, captioned=range(4, 90))
     folder = run(split_cfg(num_frames=60, selection="windows"), [source_of(tmp_path)], tmp_path / "r")
     rows = table_of(folder, ["variant", "frame_index", "caption_window", "has_caption"])
     for variant in ("ORI", "aug_001"):
@@ -325,14 +333,7 @@ def test_captions_of_several_lengths_of_windows_are_verified(tmp_path):
 
 
 def test_a_frame_between_captions_was_not_asked_for(tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 1, 30, width_px=32, height_px=18)
-    captions = [
-        make_caption(flight, i, future=list(range(i + 1, i + 6)))
-        for flight in map(read_track, find_tracks(tree))
-        for i in range(4, 25, 3)
-    ]
-    write_captions(tmp_path / "captions.jsonl", captions)
-    write_inspection(tmp_path / "inspect.json", make_inspection(tree, {}))
+    make_material(tmp_path, 1, num_points=30, captioned=range(4, 25, 3), num_future=5)
     without = record_of(tmp_path, tmp_path / "r", split_cfg(num_frames=30)).history.captions.frames_without
     # Of 30 frames the first 4 and the last 5 have no whole window, 4, 7, ... 22 have a caption.
     assert without == {"no whole window, at an end of the track": 2 * 9, "not asked for": 2 * 14}

@@ -12,10 +12,10 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import pytest
+from commands import working_here
 from conftest import SHARED_DATA
 from release_lies import Lie, Row, box_moved, captioned, ids_of_things_exchanged
 from release_tampering import depth_of, errors_in, forge, set_depth
@@ -133,14 +133,10 @@ KINDS = {
 }  # fmt: skip
 
 
-def stages(cfg: RunConfig, out: Path) -> list[pipeline.Stage]:
-    with mock.patch.object(pipeline, "worker_options", return_value={"workers": 0}):
-        return pipeline.stages(cfg, out)
-
-
 def work(stages: list[pipeline.Stage]) -> None:
-    for stage in stages:
-        stage.work()
+    with working_here():
+        for stage in stages:
+            stage.work()
 
 
 class Runs:
@@ -163,14 +159,14 @@ class Runs:
     def _make(self, kind: str, map_name: str, told: list[str]) -> Path:
         shared, out = self._root / f"map_{map_name}", self._root / kind.replace(" ", "_")
         if not shared.exists():
-            work(stages(self.settings(map_name, []), shared)[: len(SHARED_STAGES)])
+            work(pipeline.stages(self.settings(map_name, []), shared)[: len(SHARED_STAGES)])
         for name in SHARED_STAGES:
             shutil.copytree(shared / name, out / name, copy_function=os.link)
         cfg = self.settings(map_name, told)
         if not kind.endswith("without captions"):
-            work(stages(cfg, out))
+            work(pipeline.stages(cfg, out))
             return out / "release/dataset"
-        work(stages(cfg, out)[:-2])
+        work(pipeline.stages(cfg, out)[:-2])
         write_captions(out / "none.jsonl", [])
         source = Source.of_files(out / "render", out / "none.jsonl", out / "inspect/inspect.json")
         return package.run(cfg.release, [source], out / "release")
