@@ -13,7 +13,6 @@ from commands import invoke
 from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions, prepared
 from specimens_release import CFG, DROPPED, build, make_inspection, release_of
-from tables import each
 
 from cosfly.formats.captions import read_captions, write_captions
 from cosfly.formats.frames import frame_name
@@ -259,7 +258,9 @@ def run(four_walks: Path, out: Path, **settings: object) -> Path:
     return dual_track.run(DualTrackConfig.model_validate(settings), [four_walks], out)
 
 
-@each(("num_frames", "expected"), [(9, []), (10, [0]), (12, [0]), (13, [0, 3]), (170, 54), (200, 64)])
+@pytest.mark.parametrize(
+    ("num_frames", "expected"), [(9, []), (10, [0]), (12, [0]), (13, [0, 3]), (170, 54), (200, 64)]
+)
 def test_the_papers_windows(num_frames, expected):
     """Windows of 10 frames, one every 3: (N - 10) / 3 + 1, which the paper calls 50 to 60 of 170 to 200 frames."""
     found = list(windows_of(num_frames, DualTrackConfig()))
