@@ -233,20 +233,13 @@ def _plain(path: Path) -> bytes:
 
 
 def differences(found: dict[str, bytes], expected: dict[str, bytes]) -> list[str]:
-    words = [f"too much: {name}" for name in found.keys() - expected.keys()]
-    words += [f"missing: {name}" for name in expected.keys() - found.keys()]
-    words += [
-        f"{name}: {_first_difference(found[name], expected[name])}"
-        for name in found.keys() & expected.keys()
-        if found[name] != expected[name]
+    """Name the files that differ, that are missing and that are too much."""
+    nothing = b"no file"
+    return [
+        f"{name}: {found.get(name, nothing)[:200]!r}, not {expected.get(name, nothing)[:200]!r}"
+        for name in sorted(found.keys() | expected.keys())
+        if found.get(name) != expected.get(name)
     ]
-    return sorted(words)
-
-
-def _first_difference(found: bytes, expected: bytes) -> str:
-    place = max(next((k for k, (a, b) in enumerate(zip(found, expected, strict=False)) if a != b), len(found)) - 40, 0)
-    one, two = (text[place : place + 80] for text in (found, expected))
-    return f"{len(found)} bytes, not {len(expected)}, from {place} on {one!r}, not {two!r}"
 
 
 def called_complete(root: Path, wholes: list[Path]) -> list[str]:
