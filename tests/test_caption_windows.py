@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 from specimens_captions import VOCABULARY
-from tables import each
 from teacher_server import TeacherServer
 
 from caption.schema import CaptionConfig, FutureMotion, ImageConfig, ObservedWindow, WindowConfig, observed_frames
@@ -38,7 +37,7 @@ def flight_in(root):
     return read_track(find_tracks(root)[0])
 
 
-@each(
+@pytest.mark.parametrize(
     ("num_points", "stride", "expected"),
     [(9, 1, []), (10, 1, [4]), (12, 1, [4, 5, 6]), (20, 5, [4, 9, 14]), (0, 1, [])],
 )

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from tables import each
 
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.episodes import Episode, EpisodeFrame, episode_file, read_episode, write_episode
@@ -117,7 +116,7 @@ def test_the_most_alike_differs_least_the_greatest_id_of_several():
     assert people.most_alike([]) == (None, None)
 
 
-@each(("field", "value"), [("top", "toga"), ("hat_color", "red"), ("figure", 3), ("bag", None)])
+@pytest.mark.parametrize(("field", "value"), [("top", "toga"), ("hat_color", "red"), ("figure", 3), ("bag", None)])
 def test_what_the_wardrobe_lacks_is_refused(field, value):
     bare = asdict(Appearance("man", "jacket", "red", "shorts", "blue"))
     with pytest.raises(InputError, match=field):
@@ -155,7 +154,7 @@ def test_a_record_is_read_as_it_was_written_and_tells_lead_and_decisions_apart(t
     assert [f.time_s for f in found.flown] == [1.5, 2.0]  # what came of the two decisions
 
 
-@each(("change", "words"), [
+@pytest.mark.parametrize(("change", "words"), [
     ({"frames": [{"time_s": 0.5}]}, "missing|required"),
     ({"ended": "tired"}, "finished"),
     ({"colour": "red"}, "[Ee]xtra"),

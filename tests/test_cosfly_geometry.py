@@ -10,7 +10,6 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from tables import each
 
 from cosfly.formats.boxes import make_box_map
 from cosfly.formats.kinds import KINDS
@@ -87,7 +86,7 @@ def surface_at(depth_m: float, kind: str = "Buildings", number: int = 7) -> View
     return View(np.full((90, 160), depth_m, np.float32), instance, np.eye(3), np.zeros(3))
 
 
-@each(
+@pytest.mark.parametrize(
     ("kinds", "is_same"),
     [(("Roads", "Roads"), True), (("Roads", "Sidewalks"), False), (("Buildings", "Buildings"), False)],
 )

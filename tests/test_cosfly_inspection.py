@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tables import each
 
 from cosfly.formats.boxes import make_box_map, read_boxes, write_boxes
 from cosfly.formats.frames import BystanderMeta, BystandersMeta, depth_file, frame_name, read_depth, read_instance
@@ -127,7 +126,7 @@ def planned_as(trace: DroneTrace, cfg: InspectConfig, most_degps: float = 60.0) 
     return {issue.code: issue.severity for issue in report.issues}
 
 
-@each(("change", "code", "severity"), [
+@pytest.mark.parametrize(("change", "code", "severity"), [
     ({"positions": 3.0}, "acceleration", "error"),
     ({"positions": 3.0}, "jerk", "error"),
     ({"positions": 1.0}, "smoothness", "warning"),

@@ -12,7 +12,6 @@ import pytest
 import shapely
 from benchmarks.census_town import CENSUS, census_town
 from shapely.geometry import Point, Polygon, box
-from tables import each
 
 from cosfly.formats.boxes import BoxMap, read_boxes
 from cosfly.formats.kinds import KINDS
@@ -192,7 +191,7 @@ def footprint(box_map: BoxMap, row: int, *, with_yaw: bool = True) -> Polygon:
     return shapely.affinity.rotate(box(x - size[0] / 2, y - size[1] / 2, x + size[0] / 2, y + size[1] / 2), yaw)
 
 
-@each("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_town_has_what_the_passes_and_the_walks_need(seed):
     town = load_map(MapsConfig(), seed=seed)
     kinds = set(town.counts())
@@ -228,7 +227,7 @@ def test_the_census_town_has_the_papers_counts_and_simplifies_to_a_few_thousand(
     assert cross_validate(town, result.box_map)["iou"] > 0.92  # the paper's figure
 
 
-@each(
+@pytest.mark.parametrize(
     ("given", "words"),
     [({"preset": "rivers"}, "did you mean 'river'"), ({"preset": ["park"]}, "valid string"),
         ({"num_blocks": 6}, "raise size_m")],

@@ -14,7 +14,6 @@ from scipy.optimize import minimize
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenario_of, town_of, walk_along, written
-from tables import each
 
 import cosfly.planners.stage as planners
 from cosfly.formats.traces import read_traces
@@ -80,7 +79,7 @@ def shaken(world):
     return points, problem, obstacles
 
 
-@each("world", ["empty", "canyon", "corner", "tower_behind"])
+@pytest.mark.parametrize("world", ["empty", "canyon", "corner", "tower_behind"])
 def test_terms_agree_with_their_definitions(world):
     points, problem, obstacles = shaken(world)
     state = loss.make_state(len(points), len(obstacles.rows))
@@ -109,7 +108,7 @@ def test_gradient_is_the_derivative_of_the_loss():
         assert gradient[i, axis] == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4, abs=1e-3)
 
 
-@each("world", WORLDS)
+@pytest.mark.parametrize("world", WORLDS)
 def test_the_loss_never_rises_and_the_flight_is_safe(world):
     scenario, obstacles = scenario_of(world)
     problem = muco.make_problem(scenario, CFG)
@@ -146,7 +145,7 @@ def test_the_end_is_within_five_percent_of_a_general_solver(world):
     assert solver["loss_end"] <= 1.05 * general.fun
 
 
-@each("name", ["five_ray_mean", "accel_rms_mps2", "jerk_rms_mps3"])
+@pytest.mark.parametrize("name", ["five_ray_mean", "accel_rms_mps2", "jerk_rms_mps3"])
 def test_the_prefilter_has_three_rules_of_motion_and_sight(name):
     fine = {"five_ray_mean": 0.40, "accel_rms_mps2": 5.0, "jerk_rms_mps3": 10.0}
     assert planners.drop_reason(fine, CFG, True) is None
@@ -225,7 +224,7 @@ def cheapest_by_trying_all(places, own, longest_m, index, clearance_m, links, nu
     return cost.min()
 
 
-@each("seed", range(3))
+@pytest.mark.parametrize("seed", range(3))
 def test_no_sequence_of_places_is_cheaper(seed):
     rng, num_azimuths, obstacles = np.random.default_rng(seed), 8, random_town(seed)
     made = foresight.make_lattice(straight_scenario(obstacles, 6.0), climbing=False)
@@ -242,7 +241,7 @@ def test_no_sequence_of_places_is_cheaper(seed):
     assert cost == pytest.approx(cheapest_by_trying_all(places, own, longest_m, obstacles, 3.0, *settings))
 
 
-@each("seed", range(3))
+@pytest.mark.parametrize("seed", range(3))
 def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
     obstacles = random_town(seed)
     scenario = straight_scenario(obstacles, 60.0)
@@ -257,7 +256,7 @@ def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
     assert trajectory_metrics.derivative_rms(points, 3) <= max(0.3 * trajectory_metrics.derivative_rms(raw, 3), 0.05)
 
 
-@each(
+@pytest.mark.parametrize(
     ("place_m", "velocity_mps"),
     [((-20, 0, 20), (1.2, 0, 0)), ((45, 3, 24), (-6, 0, 2)), ((-60, 0, 30), (-9, 0, 0)), ((5, 2, 12), (0, 0, -2))],
 )

@@ -18,7 +18,6 @@ from commands import invoke
 from pydantic import BaseModel
 from shapely.geometry import Polygon
 from specimens_png import png_around
-from tables import each
 
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.frames import depth_bytes, read_depth, rgb_bytes
@@ -210,7 +209,7 @@ def test_arrays_are_read_as_numpy_reads_them(order):
 GOOD = _npy(np.zeros((7, 5), np.float32))
 
 
-@each("data", [
+@pytest.mark.parametrize("data", [
     GOOD[:-1], GOOD + b"\0", GOOD[:40], b"", GOOD.replace(b"(7, 5)", b"(5, 7, 1)"), GOOD.replace(b"<f4", b"<f8"),
     GOOD.replace(b"<f4", b"|O4"),
     GOOD.replace(b"<f4", b"<q9"), GOOD.replace(b"(7, 5)", b"(-7,-5)"),
@@ -218,7 +217,7 @@ GOOD = _npy(np.zeros((7, 5), np.float32))
     _npy(np.zeros((7, 5), ">f4")), GOOD[:8] + b"\xff\xff" + GOOD[10:], GOOD[:6] + b"\7" + GOOD[7:],
     _npy(np.zeros(3, [("a", "<f4")])),
     _npy(np.zeros((0, 5), np.float32)).replace(b"(0, 5)", b"(0, %d)" % 2**61),
-], ids=str)  # fmt: skip
+])  # fmt: skip
 def test_other_arrays_are_refused(data):
     with pytest.raises(InputError):
         arrays.parse_array(data, "x", dtype=np.float32, ndim=2)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from tables import each
 from test_renderers_contract import circling, pose_towards, street, write_inputs
 
 from cosfly.formats.boxes import BoxMap, make_box_map
@@ -177,7 +176,7 @@ def shaken(before: Poses, box_map: BoxMap, cfg: PerturbationConfig, seed: int = 
     return perturb(before, cameras, Surroundings(box_map), cfg, np.random.default_rng(seed))
 
 
-@each("sampling", ["cubic", "spherical"])
+@pytest.mark.parametrize("sampling", ["cubic", "spherical"])
 def test_perturbed_frames_keep_their_promises(sampling):
     cfg = PerturbationConfig(sampling=sampling)
     before, after = planned(), perturbed(cfg)
@@ -213,7 +212,7 @@ def test_perturbed_frames_keep_their_promises(sampling):
     np.testing.assert_array_equal(after.poses.rotations_deg[still], before.rotations_deg[still])
 
 
-@each("sampling", ["cubic", "spherical"])
+@pytest.mark.parametrize("sampling", ["cubic", "spherical"])
 def test_smooth_perturbations_keep_probabilities_and_radii_and_move_as_a_drone_and_a_walker_could(sampling):
     cfg = PerturbationConfig(sampling=sampling, correlation_s=6.0, max_roll_deg=4.0)
     n, dt_s = 4000, 0.5
@@ -292,7 +291,7 @@ def along_a_wall(gap_m: float) -> tuple[Poses, BoxMap]:
     return Poses(drones, rotations, targets, np.full(n, gap_m)), wall
 
 
-@each(("gap_m", "least_m"), [(12.0, 3.0), (4.0, 3.0), (3.0, 3.0), (2.5, 2.5)])
+@pytest.mark.parametrize(("gap_m", "least_m"), [(12.0, 3.0), (4.0, 3.0), (3.0, 3.0), (2.5, 2.5)])
 def test_a_whole_flight_along_a_planted_wall_keeps_the_planners_clearance(gap_m, least_m):
     """3.0 m, or as near as the plan itself where that flies at its relaxed floor of 2.5 m; far from the wall nothing
     falls back."""
@@ -307,7 +306,7 @@ def test_a_whole_flight_along_a_planted_wall_keeps_the_planners_clearance(gap_m,
     assert (careless.poses.clearances_m.min() < 2.5) == (gap_m < 6.0), "or the wall would prove nothing"
 
 
-@each(("data", "word"), [
+@pytest.mark.parametrize(("data", "word"), [
     ({"fovs_deg": []}, "fovs_deg"),
     ({"tracks": ["clean", "clean"]}, "only once"),
     ({"town": "../x"}, "letters"),

@@ -13,7 +13,6 @@ import pytest
 import typer
 import yaml
 from pydantic import BaseModel
-from tables import each
 
 import cosfly
 from cosfly.cli import app
@@ -105,7 +104,7 @@ def test_the_folders_of_the_extending_page_are_the_disk():
     assert sorted(told) == sorted(disk - {"cosfly"})
 
 
-@each("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_paths_exist(page):
     text = page.read_text(encoding="utf-8")
     words = set(

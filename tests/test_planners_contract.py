@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from specimens_planning import CANYON, WORLDS, assert_safe, town_of, walk_along, written
-from tables import each
 
 from cosfly.formats.frames import Camera
 from cosfly.formats.traces import read_traces
@@ -122,7 +121,7 @@ def check_time_step(name: str, dt_s: float) -> None:
     assert trace.metrics["accel_rms_mps2"] == pytest.approx(np.sqrt((accel**2).mean()), abs=1e-3)
 
 
-@each("name", ALL_PLANNERS)
+@pytest.mark.parametrize("name", ALL_PLANNERS)
 def test_where_there_is_no_way_it_says_so(name):
     roof = kernels.obstacle_index(town_of(((0, 0, 60), (300, 300, 50))))
     scenario = make_scenario(walk_along("w", [(0, 0), (50, 0)]), roof, PlanConfig())

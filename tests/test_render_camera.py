@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tables import each
 from test_cosfly_render import needs_gl
 from test_renderers_contract import WALKER, circling, opened, pose_towards, street, write_inputs
 
@@ -319,7 +318,7 @@ def test_a_configuration_in_which_the_target_is_small_is_remarked_on():
     assert small_targets(RunConfig.model_validate(mostly)) == []
 
 
-@each(
+@pytest.mark.parametrize(
     ("change", "is_legible"),
     [({}, True), ({"visible": False}, False), ({"visibility": 0.2}, False), ({"contrast": 3.0}, False),
         ({"contrast": None}, False), ({"bbox_2d": [0.0, 0.0, 6.0, 15.0]}, False), ({"bbox_2d": None}, False)],
