@@ -4,7 +4,6 @@ there.
 Each case names the kind of server or model that sends it, as public issue threads and manuals show it.
 """
 
-import itertools
 import json
 import time
 from pathlib import Path
@@ -316,10 +315,9 @@ DECISIONS: list[tuple[str, str | None]] = [
 ]  # fmt: skip
 
 
-def test_decisions(subtests):
-    for text, token in DECISIONS:
-        with subtests.test(text=text):
-            assert normalize_action(text) == token
+@pytest.mark.parametrize(("text", "token"), DECISIONS)
+def test_decisions(text, token):
+    assert normalize_action(text) == token
 
 
 # Why the server says that the text ended; what comes of it.
@@ -434,10 +432,10 @@ REFUSAL_BODIES = {
 }
 
 
-def test_a_refusal_is_read_as_what_it_means(subtests):
-    for (server, status, kind, text), body in itertools.product(REFUSALS, REFUSAL_BODIES):
-        with subtests.test(server=server, body=body):
-            assert kind_of(int(status), REFUSAL_BODIES[body](text, int(status))) == kind
+@pytest.mark.parametrize("body", REFUSAL_BODIES)
+@pytest.mark.parametrize(("server", "status", "kind", "text"), REFUSALS, ids=[server for server, *_ in REFUSALS])
+def test_a_refusal_is_read_as_what_it_means(server, status, kind, text, body):
+    assert kind_of(int(status), REFUSAL_BODIES[body](text, int(status))) == kind
 
 
 def test_every_meaning_is_in_the_table_and_every_server_once():
