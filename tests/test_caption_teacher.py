@@ -371,12 +371,6 @@ def test_what_a_model_declined_is_asked_again(small_tree, tmp_path, whole):
         assert run(quick(server.url), small_tree, out, retry_failed=True).read_bytes() == whole[0]
 
 
-def test_an_error_about_refused_windows_alone_names_the_cause(small_tree, tmp_path):
-    cause = r"fix the causes \(10 refused \(the server or engine refused"
-    with deciding(respond=lambda body: refusal(400, TOO_LONG)) as server, pytest.raises(NothingKept, match=cause):
-        run(quick(server.url), small_tree, tmp_path / "out")
-
-
 @pytest.mark.parametrize(("status", "text"), [
     (400, "This response_format type is unavailable now"), (422, "response_format.type `json_schema` is unavailable now"),
     (200, "response_format is not supported by this provider"),

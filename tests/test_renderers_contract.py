@@ -15,7 +15,6 @@ import sys
 import weakref
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
 
 import cv2
 import numpy as np
@@ -451,10 +450,6 @@ def test_the_checker_of_this_file_can_fail():
     shifted = intrinsic + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     wrong, _, _ = traced(street(), -0.1, pose, shifted)
     assert np.abs(wrong - depth)[away_from_silhouettes(depth, ids) & (depth < 60.0)].max() > DEPTH_TOLERANCE_M
-
-
-def test_settings_name_the_renderers_of_the_table():
-    assert set(get_args(RenderConfig.model_fields["backend"].annotation)) == set(RENDERERS)
 
 
 @pytest.fixture(scope="module")
