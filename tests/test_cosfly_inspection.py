@@ -258,10 +258,8 @@ FRAME = frame_name(3)
 DEFECTS = {
     "missing_file": lambda f: (f / FRAME / "rgb.png").unlink(),
     "wrong_format": lambda f: cv2.imwrite(str(f / FRAME / "rgb.png"), np.full((20, 30, 3), 9, np.uint8)),
-    "broken_image of depth": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: d.astype(np.float64)),
     "broken_image of cut depth": lambda f: (f / FRAME / "depth.npy").write_bytes(b"\x93NUMPY\x01\x00v\x00{'descr'"),
     "broken_image": lambda f: flip_byte(f / FRAME / "rgb.png", 200),
-    "broken_image cut": lambda f: (f / FRAME / "rgb.png").write_bytes((f / FRAME / "rgb.png").read_bytes()[:-40]),
     "broken_annotation": lambda f: (f / FRAME / "meta.json").write_text("{"),
     "checksum": lambda f: flip_byte(f / FRAME / "meta.json", 30),
     "depth_range": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: np.where(d > 14, np.nan, d).astype("f4")),
