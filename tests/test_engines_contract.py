@@ -19,7 +19,6 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 from specimens_captions import settings
-from specimens_distill import make_captions, prepared
 from teacher_server import CHINESE, ENGLISH, is_mirror, kept_answers
 
 from caption.schema import CaptionConfig
@@ -38,7 +37,6 @@ from cosfly.runtime.errors import ConfigError, EnvironmentMissing, StorageError,
 from cosfly.runtime.journal import Journal
 from distill.inference import stage as infer
 from distill.schema import open_split
-from specimens import make_playback_tree
 
 
 class PlainEngine:
@@ -347,16 +345,13 @@ def test_an_answer_that_the_engine_gave_up_is_none(stand_in, tree, model, tmp_pa
     assert len(list(read_captions(run(vllm_settings(model), tree, tmp_path / "out")))) == 5
 
 
-def test_a_student_answers_in_the_same_engine(stand_in, tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 3, 8, with_augmented=False)
-    make_captions(tmp_path / "captions.jsonl", tree)
-    training_set = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
+def test_a_student_answers_in_the_same_engine(stand_in, place, tmp_path):
     student = tmp_path / "student"
     student.mkdir()
     (student / "config.json").write_text(json.dumps({"model_type": "qwen3_5"}))
     (student / "model.safetensors").touch()
     cfg = infer.InferConfig(split="train", engine="vllm", constrained=True)
-    predictions = read_predictions(infer.run(cfg, training_set, [tree], student, tmp_path / "out"))
-    assert len(predictions) == len(stand_in.asked) == len(list(open_split(training_set, "train")))
+    predictions = read_predictions(infer.run(cfg, place / "set", [place / "tree"], student, tmp_path / "out"))
+    assert len(predictions) == len(stand_in.asked) == len(list(open_split(place / "set", "train")))
     assert all(prediction.coc is not None for prediction in predictions)
     assert stand_in.templates == [{"enable_thinking": False}] * len(predictions)
