@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions, prepared
-from specimens_release import CFG, DROPPED, build, make_inspection, release_of
+from specimens_release import DROPPED, release_of
 
 from cosfly.formats.captions import read_captions, write_captions
 from cosfly.formats.frames import frame_name
-from cosfly.formats.inspection import write_inspection
 from cosfly.formats.playback import Track
 from cosfly.formats.playback_file import read_track
 from cosfly.geometry.splits import SPLITS
@@ -384,11 +383,8 @@ def test_pytorch_loads_them_with_two_workers(place):
 
 
 def test_frames_are_scaled_to_the_size_that_pixels_in_the_texts_refer_to(place, tmp_path):
-    small = [caption.model_copy(update={"picture_px": (48, 27)}) for caption in read_captions(place / "captions.jsonl")]
     (tmp_path / "tree").symlink_to(place / "tree")
-    write_captions(tmp_path / "captions.jsonl", small)
-    write_inspection(tmp_path / "inspect.json", make_inspection(place / "tree", {}))
-    build(tmp_path, tmp_path / "release", CFG.model_copy(update={"selection": "all"}))
+    release_of(tmp_path, picture_px=(48, 27), selection="all")
     assert WindowDataset(tmp_path / "release")[0]["frames"].shape == (5, 3, 27, 48)
 
 
