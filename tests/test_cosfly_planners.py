@@ -10,10 +10,19 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scipy.optimize import minimize
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
-from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenario_of, town_of, walk_along, written
+from specimens_planning import (
+    CANYON,
+    WORLDS,
+    assert_safe,
+    first_points,
+    scenario_of,
+    solved_by_scipy,
+    town_of,
+    walk_along,
+    written,
+)
 
 import cosfly.planners.stage as planners
 from cosfly.formats.traces import read_traces
@@ -130,18 +139,7 @@ def test_the_end_is_within_five_percent_of_a_general_solver(world):
     problem = muco.make_problem(scenario, CFG)
     first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
     _, solver, _ = muco.optimize(first, problem, obstacles, CFG.muco)
-    state, unmasked = loss.make_state(len(first), len(obstacles.rows)), np.zeros(len(first), dtype=bool)
-
-    def loss_and_gradient(interior):
-        points = np.vstack([first[:1], interior.reshape(-1, 3), first[-1:]])
-        value = loss.evaluate(points, problem, obstacles, unmasked, state)
-        return value, (state.gradient + state.visibility_gradient)[1:-1].reshape(-1)
-
-    bounds = [(None, None), (None, None), (20.0, 100.0)] * (len(first) - 2)
-    settings = {"maxiter": 400, "maxfun": 800}
-    general = minimize(
-        loss_and_gradient, first[1:-1].reshape(-1), jac=True, method="L-BFGS-B", bounds=bounds, options=settings
-    )
+    general = solved_by_scipy(first, problem, obstacles, maxiter=400, maxfun=800)
     assert solver["loss_end"] <= 1.05 * general.fun
 
 
