@@ -39,24 +39,12 @@ from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import make_track_script, open_renderer, run
 from cosfly.render.track import find_goal, render_track
 from cosfly.runtime.config import build
-from cosfly.runtime.errors import ConfigError, EnvironmentMissing
+from cosfly.runtime.errors import ConfigError
 from cosfly.runtime.io import read_checksums, sha256_file
 
 CAMERA = Camera(320, 180, intrinsic_matrix(320, 180, 90.0))
 ALL_MESHES = unit_meshes.all_meshes()
 SMALL = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0, 90.0], "town": "Street", "first_timestamp": 1776000000}
-
-
-def without_gl() -> str:
-    try:
-        open_renderer("gl", make_box_map([], [], [], []), 16, 16).close()
-    except EnvironmentMissing as error:
-        return str(error)
-    return ""
-
-
-NO_GL = without_gl()
-needs_gl = pytest.mark.skipif(bool(NO_GL), reason=NO_GL)
 
 
 def test_instance_ids_are_the_boxes_own_where_they_fit():
@@ -326,7 +314,6 @@ def finished(tmp_path_factory):
     return run(build(RenderConfig, SMALL, "test"), *inputs, folder / "out", seed=5), inputs
 
 
-@needs_gl
 def test_the_tree_is_complete_and_readable(finished):
     tree, _ = finished
     folders = find_tracks(tree)
@@ -345,7 +332,6 @@ def test_the_tree_is_complete_and_readable(finished):
     assert (manifest["num_traces"], manifest["num_traces_not_rendered"], manifest["num_frames"]) == (3, 1, 18)
 
 
-@needs_gl
 def test_frames_hold_what_their_annotation_says(finished):
     tree, _ = finished
     for folder in find_tracks(tree):
@@ -441,7 +427,6 @@ def test_a_walled_in_person_is_not_moved():
 LOOKS = Appearance("man", "jacket", "blue", "trousers", "red")
 
 
-@needs_gl
 @pytest.mark.parametrize(("y_m", "says_legs"), [(8.0, True), (-8.0, False)])
 def test_what_a_wall_hides_is_not_said(y_m, says_legs):
     """Two men whose trousers alone differ; to the south of them is a wall as high as their hips."""
@@ -469,8 +454,6 @@ def test_what_a_wall_hides_is_not_said(y_m, says_legs):
 @pytest.fixture(scope="session")
 def crowded_tree(built_once):
     """Two walks, both tracks, each among eight bystanders of whom four look alike the target but for one thing."""
-    if NO_GL:
-        pytest.skip(NO_GL)
     return built_once("crowd", make_crowded_tree) / "out"
 
 

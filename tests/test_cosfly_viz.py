@@ -17,7 +17,6 @@ from commands import invoke
 from PIL import Image
 from specimens_captions import VOCABULARY
 from specimens_distill import WINDOW, make_caption
-from test_cosfly_render import needs_gl
 from test_renderers_contract import DRAWN, circling, street, write_inputs
 
 from caption.schema import CaptionConfig, ImageConfig, Window, WindowConfig
@@ -285,7 +284,6 @@ def street_tree(tmp_path_factory) -> Path:
     return render(RenderConfig.model_validate({**DRAWN, "tracks": ["clean"]}), *inputs, folder / "render")
 
 
-@needs_gl
 def test_four_pictures_of_a_frame(street_tree, tmp_path):
     boxes = tmp_path / "boxes_3d.json"
     write_boxes(boxes, street())
