@@ -162,9 +162,6 @@ def test_what_becomes_of_a_run_at_a_server_like_this(tree, tmp_path, whole, name
         with pytest.raises(error_kind) as caught:
             run(settings(server.url, endpoint=patience[0] if patience else {}), tree, out)
         assert words in str(caught.value)
-        assert "\n" not in str(caught.value)
-        assert str(caught.value).isprintable()
-        assert len(str(caught.value)) < 2000
         # One who waits so short a time may be gone before a busy server has read what was asked, which then comes late.
         asked = len(server.bodies)
         assert asked <= most_asked if patience else asked == most_asked
@@ -318,8 +315,6 @@ def test_what_becomes_of_a_run_at_a_list_of_models_like_this(tree, tmp_path, mon
             with pytest.raises(TeacherError) as caught:
                 run(settings(server.url, endpoint=impatient), tree, out)
             assert words in str(caught.value)
-            assert str(caught.value).isprintable()
-            assert len(str(caught.value)) < 2000
             assert "very-secret" not in str(caught.value)
             assert not server.bodies
             server.list_models = None  # it is mended

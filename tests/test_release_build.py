@@ -268,7 +268,6 @@ def test_each_shard_that_cannot_be_written_is_named(copy, tmp_path, monkeypatch)
     with pytest.raises(InputError, match="nothing is released") as caught:
         run(split_cfg(), [source_of(copy)], tmp_path / "r")
     assert all(str(picture) in str(caught.value) for picture in pictures)
-    assert "\n" not in str(caught.value)
 
 
 def test_after_a_failed_flight_the_finished_shards_are_not_done_again(tmp_path, monkeypatch):
