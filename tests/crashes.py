@@ -24,6 +24,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from cosfly.runtime import worker
@@ -38,6 +39,9 @@ GONE_S = 30.0  # for workers to be gone after the process that was killed with t
 NAMES = {"os.rename": 2, "os.link": 2, "os.remove": 1, "os.mkdir": 1, "os.rmdir": 1, "os.truncate": 1, "os.symlink": 2}
 
 
+Kind = tuple[str, str, str]
+
+
 @dataclass(frozen=True)
 class Step:
     """One step of an undisturbed run: what is done, to which path below the watched folder, and where in our code."""
@@ -47,7 +51,7 @@ class Step:
     place: str
 
     @property
-    def kind(self) -> tuple[str, str, str]:
+    def kind(self) -> Kind:
         """Steps of one kind differ in the numbers of their names alone; in a folder that has not its name yet, in the
         files too."""
         path, partial, _ = self.path.partition(".partial/")
@@ -58,20 +62,15 @@ class Step:
         return self.path.endswith(".partial") and self.event not in ("os.mkdir", "os.rmdir")
 
 
-@dataclass(frozen=True)
-class Moment:
-    """The n-th step of a kind, n from 1 on: how many others come between, as what workers tell of themselves, may
-    differ."""
-
-    kind: tuple[str, str, str]
-    number: int
+# The n-th step of a kind, n from 1 on: how many others come between, as what workers tell of themselves, may differ.
+Moment = tuple[Kind, int]
 
 
 class _Watch:
     """Counts the steps of this process and of those that it forks, and ends them all at one of them."""
 
-    def __init__(self, root: Path, die_at: Moment | None, traced: int | None) -> None:
-        self.root, self.die_at, self.traced = f"{root}{os.sep}", die_at, traced
+    def __init__(self, root: Path, die_at: Moment | None, trace: int) -> None:
+        self.root, self.die_at, self.trace = f"{root}{os.sep}", die_at, trace
         self.count = multiprocessing.get_context("fork").Value("q", 0)
 
     def begin(self) -> None:
@@ -129,13 +128,12 @@ class _Watch:
         if not self._is_watched(path):
             return
         step = Step(event, os.path.abspath(os.fsdecode(path)).removeprefix(self.root), _place())
-        if self.traced is not None:
-            os.write(self.traced, f"{json.dumps([step.event, step.path, step.place])}\n".encode())
-        if self.die_at is None or step.kind != self.die_at.kind:
+        os.write(self.trace, f"{json.dumps([step.event, step.path, step.place])}\n".encode())
+        if self.die_at is None or step.kind != self.die_at[0]:
             return
         with self.count.get_lock():
             self.count.value += 1
-            is_now = self.count.value == self.die_at.number
+            is_now = self.count.value == self.die_at[1]
         if is_now:
             if half is not None:
                 half()
@@ -160,7 +158,7 @@ class Ended:
     steps: list[Step]
 
 
-def run(work: Callable[[], object], root: Path, *, die_at: Moment | None = None, traces: bool = False) -> Ended:
+def run(work: Callable[[], object], root: Path, die_at: Moment | None = None) -> Ended:
     """Run something in a child of its own that forks its workers; die_at None: undisturbed."""
     resource_tracker.ensure_running()
     said, trace = root.with_name(f"{root.name}.said"), root.with_name(f"{root.name}.steps")
@@ -168,7 +166,7 @@ def run(work: Callable[[], object], root: Path, *, die_at: Moment | None = None,
     with open(said, "wb") as voice, open(trace, "wb") as steps:
         child = os.fork()
         if not child:
-            _be_child(work, _Watch(root, die_at, steps.fileno() if traces else None), voice.fileno())
+            _be_child(work, _Watch(root, die_at, steps.fileno()), voice.fileno())
         os.close(held)
         _, status = os.waitpid(child, 0)
     select.select([gone], [], [], GONE_S)
@@ -186,7 +184,9 @@ def _be_child(work: Callable[[], object], watch: _Watch, voice: int) -> None:
         os.dup2(voice, 1)
         os.dup2(voice, 2)
         sys.stdout = sys.stderr = os.fdopen(voice, "w", buffering=1, closefd=False)
-        worker.multiprocessing = _Forking()  # type: ignore[assignment]
+        # Workers that inherit the watch, and all that is imported.
+        forking = SimpleNamespace(get_context=lambda _: multiprocessing.get_context("fork"))
+        worker.multiprocessing = forking  # type: ignore[assignment]
         watch.begin()
         work()
         code = 0
@@ -197,14 +197,6 @@ def _be_child(work: Callable[[], object], watch: _Watch, voice: int) -> None:
     finally:
         sys.stdout.flush()
         os._exit(code)
-
-
-class _Forking:
-    """In the place of `multiprocessing`: workers that inherit the watch, and all that is imported."""
-
-    @staticmethod
-    def get_context(_: str) -> Any:
-        return multiprocessing.get_context("fork")
 
 
 TIMES = re.compile(
@@ -233,20 +225,13 @@ def _plain(path: Path) -> bytes:
 
 
 def differences(found: dict[str, bytes], expected: dict[str, bytes]) -> list[str]:
-    words = [f"too much: {name}" for name in found.keys() - expected.keys()]
-    words += [f"missing: {name}" for name in expected.keys() - found.keys()]
-    words += [
-        f"{name}: {_first_difference(found[name], expected[name])}"
-        for name in found.keys() & expected.keys()
-        if found[name] != expected[name]
+    """Name the files that differ, that are missing and that are too much."""
+    nothing = b"no file"
+    return [
+        f"{name}: {found.get(name, nothing)[:200]!r}, not {expected.get(name, nothing)[:200]!r}"
+        for name in sorted(found.keys() | expected.keys())
+        if found.get(name) != expected.get(name)
     ]
-    return sorted(words)
-
-
-def _first_difference(found: bytes, expected: bytes) -> str:
-    place = max(next((k for k, (a, b) in enumerate(zip(found, expected, strict=False)) if a != b), len(found)) - 40, 0)
-    one, two = (text[place : place + 80] for text in (found, expected))
-    return f"{len(found)} bytes, not {len(expected)}, from {place} on {one!r}, not {two!r}"
 
 
 def called_complete(root: Path, wholes: list[Path]) -> list[str]:
@@ -298,7 +283,7 @@ def sweep(
     Args:
         works: commands that write into the folder `out` of `root`; the last is killed, where those before it have done
             their work.
-        few: at some of the steps, see `chosen`. twice: also the run that goes on is killed, at some step.
+        few: at some of the steps, see `moments`. twice: also the run that goes on is killed, at some step.
         only: a pattern of the paths at whose steps it is killed.
     """
     out, whole, begun, rng = root / "out", root / "whole", root / "begun", random.Random(0)
@@ -311,53 +296,44 @@ def sweep(
     steps = _run_through(works[-1], out).steps
     out.rename(whole)
     expected, swept = contents(whole), Swept(len(steps), 0, [])
-    for moment in chosen(steps, few=few):
-        if not re.fullmatch(only, moment.kind[1]):
+    for moment in moments(steps, few=few):
+        (event, path, place), number = moment
+        if not re.fullmatch(only, path):
             continue
         shutil.rmtree(out, ignore_errors=True)
         shutil.copytree(begun, out)
-        killed = run(works[-1], out, die_at=moment)
+        killed = run(works[-1], out, moment)
         swept.num_killed += killed.code == -signal.SIGKILL
         found = called_complete(out, [whole, begun])
         if twice:
-            swept.num_killed += run(works[-1], out, die_at=rng.choice(moments(steps))).code == -signal.SIGKILL
+            swept.num_killed += run(works[-1], out, rng.choice(moments(steps))).code == -signal.SIGKILL
         again = run(works[-1], out)
         found += (
             differences(contents(out), expected) if again.code == 0 else [f"exit {again.code}: {again.said[-800:]}"]
         )
-        event, path, place = moment.kind
-        swept.wrong += [f"killed at {event} {path} ({place}), time {moment.number}: {words}" for words in found]
+        swept.wrong += [f"killed at {event} {path} ({place}), time {number}: {words}" for words in found]
     return swept
 
 
 def _run_through(work: Callable[[], object], out: Path) -> Ended:
-    ended = run(work, out, traces=True)
+    ended = run(work, out)
     assert ended.code == 0, ended.said
     return ended
 
 
-def moments(steps: list[Step]) -> list[Moment]:
-    counts = Counter[tuple[str, str, str]]()
-    found = []
-    for step in steps:
-        counts[step.kind] += 1
-        found.append(Moment(step.kind, counts[step.kind]))
-    return found
-
-
-def chosen(steps: list[Step], *, few: bool) -> list[Moment]:
+def moments(steps: list[Step], *, few: bool = False) -> list[Moment]:
     """Give the moments of the kills.
 
     Args:
         few: of each kind the first and the last, and of a file that is written under another name only that it gets its
             own.
     """
-    found = moments(steps)
-    if not few:
-        return found
-    last = {moment.kind: moment.number for moment in found}
+    counts, found = Counter[Kind](), []
+    for step in steps:
+        counts[step.kind] += 1
+        found.append((step, counts[step.kind]))
     return [
-        moment
-        for moment, step in zip(found, steps, strict=True)
-        if moment.number in (1, last[moment.kind]) and not step.is_of_a_temporary_file
+        (step.kind, number)
+        for step, number in found
+        if not few or (number in (1, counts[step.kind]) and not step.is_of_a_temporary_file)
     ]

@@ -19,8 +19,8 @@ from cosfly.formats.frames import depth_bytes
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_file
 from release import columns
-from release.build.shards import open_writer
-from release.build.stage import write_records
+from release.build.shards import open_writer, points_part
+from release.build.stage import name_shards, write_records
 from release.counting import count_release, numbers_of
 from release.record import (
     ReleasedFlight,
@@ -30,16 +30,11 @@ from release.record import (
     digest_of,
     numbers_of_splits,
     read_record,
-    shard_paths,
 )
 from release.verify.verify import verify
 
 Row = dict[str, Any]
 CONSTANT = [column.name for column in columns.POINTS if column.constant]
-
-
-def _nothing(rows: list[Row]) -> None:
-    pass
 
 
 def read_all(dataset: Path) -> tuple[ReleaseRecord, list[list[Row]]]:
@@ -50,56 +45,50 @@ def read_all(dataset: Path) -> tuple[ReleaseRecord, list[list[Row]]]:
 def forge(
     dataset: Path,
     out: Path,
-    change: Callable[[list[Row]], None] = _nothing,
+    change: Callable[[list[Row]], None] = lambda rows: None,
     change_record: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> Path:
     """Copy a release, change all of its rows together, then its record, and make everything that counts or hashes them
     right again."""
-    if change is _nothing:
-        values = read_record(dataset / "release.json").model_dump(mode="json")
-        shutil.copytree(dataset, out, dirs_exist_ok=True)
-        return _finished(out, values, change_record)
     record, shards = read_all(dataset)
     tables = [pq.read_table(dataset / shard.points.path).to_pylist() for shard in record.shards]
     of_row = _points_of(shards, tables)
-    change([row for rows in shards for row in rows])
+    all_rows = [row for rows in shards for row in rows]
+    change(all_rows)
     for row, point, track in of_row:  # the points of changed rows say the same
         for other in track:
             other.update({name: row[name] for name in CONSTANT})
         point.update({name: row[name] for name in point})
-    shutil.rmtree(out, ignore_errors=True)
-    entries = []
+    parts = out.with_name("parts")
+    for folder in (out, parts):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+    written, schema = [], columns.schema(record.settings.modalities)
     for old, rows, points in zip(record.shards, shards, tables, strict=True):
-        (out / "data").mkdir(parents=True, exist_ok=True)
-        (out / "points").mkdir(exist_ok=True)
-        path, schema = out / "data" / f"{len(entries)}.parquet", columns.schema(record.settings.modalities)
-        with open_writer(str(path), schema) as writer:
+        part = parts / f"{len(written)}.parquet"
+        with open_writer(str(part), schema) as writer:
             for at in range(0, len(rows), 50):
                 writer.write_table(pa.Table.from_pylist(rows[at : at + 50], schema=schema))
-        of_points = out / "points" / path.name
-        pq.write_table(pa.Table.from_pylist(points, schema=columns.points_schema()), of_points)
-        entries.append(Shard(split=old.split, points=_stored(of_points), **vars(_stored(path))))
-    paths = shard_paths([entry.split for entry in entries], digest_of(entries))
-    for own, entry in zip(paths, entries, strict=True):
-        for file, new in zip((entry, entry.points), own, strict=True):
-            (out / Path(file.path).parent.name / Path(file.path).name).rename(out / new)
-            file.path = new
-    digest = digest_of(entries)
-    flights = _flights(record, [row for rows in shards for row in rows])
-    update: dict[str, Any] = {"shards": entries, "content_digest": digest, "flights": flights}
-    with_caption = Counter(row["split"] for rows in shards for row in rows if row["has_caption"])
-    update["splits"] = record.splits.model_copy(update={"splits": numbers_of_splits(flights, with_caption)})
+        pq.write_table(pa.Table.from_pylist(points, schema=columns.points_schema()), points_part(part))
+        written.append((part, Shard(split=old.split, points=_stored(points_part(part)), **vars(_stored(part)))))
+    entries = name_shards(written, out)
+    flights = _flights(record, all_rows)
+    with_caption = Counter(row["split"] for row in all_rows if row["has_caption"])
     captions = with_caption.total()
     history = record.history.model_copy(deep=True)
     history.captions.read += captions - history.captions.released
     history.captions.released = captions
-    history.captions.frames_without = {"forged": sum(map(len, shards)) - captions}
-    update["history"] = history
-    record = record.model_copy(update=update)
+    history.captions.frames_without = {"forged": len(all_rows) - captions}
+    splits = record.splits.model_copy(update={"splits": numbers_of_splits(flights, with_caption)})
+    update: dict[str, Any] = {"shards": entries, "content_digest": digest_of(entries), "flights": flights}
+    record = record.model_copy(update=update | {"splits": splits, "history": history})
     with suppress(InputError):  # rows that cannot be counted keep the numbers of the honest ones
         computed = numbers_of(count_release(out, entries), record.settings.num_frames)
         record = record.model_copy(update={"numbers": computed})
-    return _finished(out, record.model_dump(mode="json"), change_record)
+    values = record.model_dump(mode="json")
+    change_record(values)
+    write_records(out, ReleaseRecord.model_validate_json(json.dumps(values)))
+    return out
 
 
 def _stored(path: Path) -> StoredFile:
@@ -114,12 +103,6 @@ def _points_of(shards: list[list[Row]], tables: list[list[Row]]) -> list[tuple[R
         tracks[tuple(point[name] for name in columns.PLACE)].append(point)
     of_rows = [(row, tracks[tuple(row[name] for name in columns.PLACE)]) for rows in shards for row in rows]
     return [(row, track[row["frame_index"]], track) for row, track in of_rows]
-
-
-def _finished(out: Path, values: dict[str, Any], change_record: Callable[[dict[str, Any]], None]) -> Path:
-    change_record(values)
-    write_records(out, ReleaseRecord.model_validate_json(json.dumps(values)))
-    return out
 
 
 def errors_in(folder: Path, level: str = "pixels", **how: Any) -> dict[str, int]:

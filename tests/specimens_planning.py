@@ -4,6 +4,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import minimize
 
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.formats.kinds import KINDS
@@ -11,6 +12,7 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory, write_paths
 from cosfly.geometry import kernels
 from cosfly.geometry.axes import DT_S
 from cosfly.planners.contract import PlanConfig, TrackingReference
+from cosfly.planners.muco.loss import evaluate, make_state
 from cosfly.planners.stage import make_scenario
 
 
@@ -58,6 +60,20 @@ def scenario_of(world):
     box_map, corners = WORLDS[world]
     obstacles = kernels.obstacle_index(box_map)
     return make_scenario(walk_along(world, corners), obstacles, PlanConfig()), obstacles
+
+
+def solved_by_scipy(first, problem, obstacles, **options):
+    """Minimize MuCO's loss from a start by L-BFGS-B, within its altitudes."""
+    state, unmasked = make_state(len(first), len(obstacles.rows)), np.zeros(len(first), dtype=bool)
+
+    def loss_and_gradient(interior):
+        points = np.vstack([first[:1], interior.reshape(-1, 3), first[-1:]])
+        value = evaluate(points, problem, obstacles, unmasked, state)
+        return value, (state.gradient + state.visibility_gradient)[1:-1].reshape(-1)
+
+    bounds = [pair for low, _, high in problem.altitudes[1:-1] for pair in ((None, None), (None, None), (low, high))]
+    start = first[1:-1].reshape(-1)
+    return minimize(loss_and_gradient, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
 
 
 def first_points(scenario, num):

@@ -1,12 +1,11 @@
 """Small releases of the specimen tree, and what they are made of; those of conftest.py are read by many tests."""
 
 import json
-from collections import Counter, defaultdict
 from collections.abc import Callable
 from pathlib import Path
-from unittest import mock
 
 import pyarrow.parquet as pq
+from commands import working_here
 from specimens_distill import make_caption as caption_of_frame
 
 from cosfly.formats.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
@@ -17,6 +16,7 @@ from cosfly.formats.inspection import (
     TrackFunnel,
     TrackInspection,
     TrajectoryFunnel,
+    count_trajectories,
     write_inspection,
 )  # fmt: skip
 from cosfly.formats.issues import Issue
@@ -72,13 +72,10 @@ def make_inspection(tree: Path, rejected: dict[str, tuple[str, str]]) -> Inspect
         issues = [Issue(severity="error", code=code, where="x", got="y", expected="z")] if code else []
         place = {"town": town, "trajectory": trajectory, "variant": variant, "folder": name, "trace_id": trajectory}
         flights.append(TrackInspection(**place, result=result, issues=issues, metrics={}))
-    results: dict[tuple[str, str], set[str]] = defaultdict(set)
-    for flight in flights:
-        results[flight.town, flight.trajectory].add(flight.result)
-    n, worst = len(results), Counter(max(found, key=RESULTS.index) for found in results.values())
-    parts = {result: worst[result] for result in RESULTS}
-    trajectories = TrajectoryFunnel(planned=n + 3, dropped={"smoothness": 2}, not_rendered=1, rendered=n, **parts)
-    counts = {r: sum(f.result == r for f in flights) for r in ("accepted", "review", "rejected")}
+    rendered = count_trajectories(flights, planned=False)
+    planned = rendered["rendered"] + 3
+    trajectories = TrajectoryFunnel(planned=planned, dropped={"smoothness": 2}, not_rendered=1, **rendered)
+    counts = {result: sum(flight.result == result for flight in flights) for result in RESULTS}
     funnel = TrackFunnel(inspected=len(flights), without_trace=0, reasons={}, **counts)
     return Inspection(settings={}, funnel=Funnel(trajectories=trajectories, flights=funnel), flights=flights)
 
@@ -152,6 +149,6 @@ SMALL_RUN = [
 
 def run_here(told: list[str], out: Path) -> Path:
     """Go the whole way from a map to a release in this process: workers take longer to start than a few flights."""
-    with mock.patch.object(pipeline, "worker_options", return_value={"workers": 0}):
+    with working_here():
         pipeline.run(load(RunConfig, None, told), out)
     return out

@@ -26,10 +26,11 @@ FAST = {
 TWELVE = {**FAST, "samples_per_step": 4, "batch_size": 2, "epochs": 6, "max_steps": 12, "save_every_steps": 5}
 
 
-def make_place(root: Path) -> Path:
+def make_place(root: Path, **settings: Any) -> Path:
+    """Write tree/ of three walks, captions.jsonl, set/ as the settings of `distill prepare` say, and student/."""
     make_playback_tree(root / "tree", num_flights=3, num_points=7)
     make_captions(root / "captions.jsonl", root / "tree")
-    prepared(root / "tree", root / "captions.jsonl", root / "set")
+    prepared(root / "tree", root / "captions.jsonl", root / "set", **settings)
     make_random_student(root / "student")
     return root
 

@@ -30,7 +30,7 @@ CHINESE = {
     "reasoning_trace": "视线通畅且运动规律，因此该动作可将目标保持在画面内。",
 }
 
-# Faults of the text; those of the protocol are a status, "empty_choices", "echo_key" and "wrong_therefore".
+# Faults of the text; those of the protocol are a status, "empty_choices" and "wrong_therefore".
 TEXT_FAULTS: dict[str, Callable[[dict], str]] = {
     "wrong_shape": lambda answer: json.dumps({"decision": answer["flight_decision"], "why": "because"}),
     "wrong_decision": lambda answer: json.dumps(answer | {"flight_decision": "do a barrel roll"}),
@@ -173,8 +173,6 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
                 self._send_anything(responded)
             elif fault is not None and fault.isdecimal():
                 self._send(int(fault), {"error": {"message": f"planted {fault}"}})
-            elif fault == "echo_key":
-                self._send(401, {"error": {"message": f"bad key {self.headers['Authorization']}"}})
             elif fault == "empty_choices":
                 self._send(200, {"choices": []})
             else:
@@ -199,8 +197,8 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
                 with contextlib.suppress(OSError):
                     sent(self.wfile)
 
-        def _send(self, status: int, value: dict, headers: dict[str, str] | None = None) -> None:
-            self._send_bytes(status, json.dumps(value).encode(), headers)
+        def _send(self, status: int, value: dict) -> None:
+            self._send_bytes(status, json.dumps(value).encode())
 
         def _send_bytes(self, status: int, data: bytes, headers: dict[str, str] | None = None) -> None:
             try:

@@ -12,7 +12,6 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from tables import each
 from test_docs import parsed
 
 from cosfly.runtime import limits
@@ -361,7 +360,7 @@ def commands_of(tmp_path: Path, arguments: list[str], job: dict[str, str]) -> li
 RUN = ["diverse", "shared/run"]
 
 
-@each(("arguments", "job", "commands"), [
+@pytest.mark.parametrize(("arguments", "job", "commands"), [
     (RUN, {"SLURM_JOB_NUM_NODES": "1", "SLURM_CPUS_PER_TASK": "16"}, ["run"]),
     (RUN, {"SLURM_JOB_NUM_NODES": "2", "SLURM_JOB_NODELIST": "n[1-2]", "SLURM_JOB_ID": "77"}, ["run"]),
     (
@@ -381,7 +380,7 @@ def test_every_command_of_the_script_is_one_that_cosfly_takes(tmp_path, argument
         assert all(words[words.index("--out") + 1] == f"shared/run/park/{words[0]}" for words in found)
 
 
-@each(("files", "cpus", "memory"), [
+@pytest.mark.parametrize(("files", "cpus", "memory"), [
     ({"cgroup": "0::/job/step\n", "job/cpu.max": "max 100000", "job/step/cpu.max": "150000 100000",
         "job/memory.max": "1073741824", "job/step/memory.max": "max"}, 2, 2**30),
     ({"cgroup": "4:cpu,cpuacct:/docker/1\n6:memory:/docker/1\n", "cpu/docker/1/cpu.cfs_quota_us": "-1",

@@ -9,7 +9,6 @@ import pytest
 from commands import invoke
 from specimens_captions import VOCABULARY
 from specimens_distill import prepared
-from tables import each
 from teacher_server import MODEL, TeacherServer
 from test_cosfly_answers import CHINESE as ZH
 from test_cosfly_answers import GOOD as EN
@@ -79,7 +78,7 @@ def test_a_contradicted_value_is_recorded_and_drops_its_window_unless_the_settin
     assert [caption.drop_reason for caption in dropped[:2]] == ["contradicted_value", None]
 
 
-@each(("changes", "reason", "detail"), [
+@pytest.mark.parametrize(("changes", "reason", "detail"), [
     ({"decision": "do a barrel roll"}, "structure", "decision_not_in_closed_set"),
     ({"zh": ZH | {"flight_decision": "return_to_home"}}, "bilingual", "decision"),
     ({"zh": {"critical_components": "短", "reasoning_trace": "短", "flight_decision": "hover"}}, "bilingual", "structure_"),
@@ -101,7 +100,7 @@ BAD = [
 ]  # fmt: skip
 
 
-@each(("text", "field"), BAD)
+@pytest.mark.parametrize(("text", "field"), BAD)
 def test_a_bad_line_names_file_line_and_field(tmp_path, text, field):
     path = tmp_path / "theirs.jsonl"
     good = json.dumps({"sample_id": "first", "en": EN | {"flight_decision": "hover"}})

@@ -22,7 +22,6 @@ import pytest
 from commands import invoke
 from specimens_captions import VOCABULARY, deciding
 from specimens_captions import settings as quick
-from tables import each
 from teacher_server import ENGLISH, MODEL, Sent, TeacherServer, Wild, obedient_answer, refusal
 
 from caption.schema import CaptionConfig
@@ -163,9 +162,6 @@ def test_what_becomes_of_a_run_at_a_server_like_this(tree, tmp_path, whole, name
         with pytest.raises(error_kind) as caught:
             run(settings(server.url, endpoint=patience[0] if patience else {}), tree, out)
         assert words in str(caught.value)
-        assert "\n" not in str(caught.value)
-        assert str(caught.value).isprintable()
-        assert len(str(caught.value)) < 2000
         # One who waits so short a time may be gone before a busy server has read what was asked, which then comes late.
         asked = len(server.bodies)
         assert asked <= most_asked if patience else asked == most_asked
@@ -237,7 +233,7 @@ UNDERSTOOD: dict[str, tuple] = {
 }  # fmt: skip
 
 
-@each("name", UNDERSTOOD)
+@pytest.mark.parametrize("name", UNDERSTOOD)
 def test_a_server_is_understood(tree, tmp_path, name):
     respond, endpoint, outcome, words = UNDERSTOOD[name]
     out = tmp_path / "out"
@@ -263,18 +259,6 @@ def test_a_full_address_is_used_as_given(tree, tmp_path):
         assert set(server.paths) == {"/api/chat/completions"}
 
 
-def test_thoughts_that_use_up_all_tokens_are_an_answer_that_was_cut(tree, tmp_path):
-    def respond(body: dict) -> Sent:
-        choice = {"message": {"role": "assistant"}, "finish_reason": "length"}
-        return Sent(200, json.dumps({"choices": [choice], "usage": USAGE | {"completion_tokens": 0}}).encode())
-
-    with deciding(respond=respond) as server, pytest.raises(NothingKept):
-        run(settings(server.url), tree, tmp_path / "out")
-    assert len(server.bodies) == 3
-    report = json.loads((tmp_path / "out" / "caption_report.json").read_text(encoding="utf-8"))
-    assert report["structure"] == {"cut_short": 1}
-
-
 def test_prompts_that_a_server_cuts_in_silence_are_reported(tmp_path, caplog):
     caplog.set_level("INFO")
     tree = make_playback_tree(tmp_path / "tree", 1, 24, with_augmented=False)
@@ -284,7 +268,7 @@ def test_prompts_that_a_server_cuts_in_silence_are_reported(tmp_path, caplog):
     assert caplog.text.count("the first request is sent, with a limit of 60 s") == 1
 
 
-@each(("step", "is_cut"), [(2, False), (10, True)])
+@pytest.mark.parametrize(("step", "is_cut"), [(2, False), (10, True)])
 def test_only_prompts_of_clearly_different_lengths_show_a_cut(caplog, step, is_cut):
     client = ChatClient("http://localhost:1", EndpointConfig())
     reply = Reply("{}", Usage(prompt_tokens=1000, completion_tokens=1), "plain")
@@ -320,7 +304,7 @@ LISTS: dict[str, tuple] = {
 }  # fmt: skip
 
 
-@each("name", LISTS)
+@pytest.mark.parametrize("name", LISTS)
 def test_what_becomes_of_a_run_at_a_list_of_models_like_this(tree, tmp_path, monkeypatch, whole, name):
     monkeypatch.setenv(KEY_VARIABLE, "sk-very-secret")
     respond, words = LISTS[name]
@@ -331,8 +315,6 @@ def test_what_becomes_of_a_run_at_a_list_of_models_like_this(tree, tmp_path, mon
             with pytest.raises(TeacherError) as caught:
                 run(settings(server.url, endpoint=impatient), tree, out)
             assert words in str(caught.value)
-            assert str(caught.value).isprintable()
-            assert len(str(caught.value)) < 2000
             assert "very-secret" not in str(caught.value)
             assert not server.bodies
             server.list_models = None  # it is mended
@@ -442,7 +424,7 @@ DEFECTS = [
 ]
 
 
-@each(("defects", "settings", "name", "words"), [
+@pytest.mark.parametrize(("defects", "settings", "name", "words"), [
     ({"in_parts": True, "takes_null": False}, {"endpoint": {"extra_body": {"temperature": None}}}, "answers", ""),
     ({"refuses_schema": True}, {"endpoint": {"json_schema": False}}, "JSON schema", "switched off"),
     ({"max_images": 0}, {"image": {"modalities": []}}, "answers", ""),
@@ -453,7 +435,7 @@ def test_what_the_settings_do_without_is_no_defect(defects, settings, name, word
     assert words in findings[name].detail
 
 
-@each(("defect", "name", "state", "words"), DEFECTS, ids=lambda value: str(value))
+@pytest.mark.parametrize(("defect", "name", "state", "words"), DEFECTS, ids=lambda value: str(value))
 def test_a_defect_is_found(defect, name, state, words):
     findings = examine(patient(**defect), defect.get("context", CONTEXT))
     assert findings[name].state == state
@@ -474,7 +456,7 @@ def test_a_slow_answer_to_the_largest_prompt_is_no_matter_of_the_context():
     )
 
 
-@each("defect", [{}, {"refuses_schema": True}], ids=str)  # a refused schema is a request, too
+@pytest.mark.parametrize("defect", [{}, {"refuses_schema": True}], ids=str)  # a refused schema is a request, too
 def test_an_examination_with_a_limit(defect):
     for limit in (2, 3):
         with TeacherServer(respond=patient(**defect)) as server:

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from specimens_captions import GAP, SLOTS, report_of, saying, settings
-from tables import each
 from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror
 
 from caption.answer_formats.formats import Draft, Filler, Refused, fact_table
@@ -37,7 +36,7 @@ def filled(text: str, language: Language, facts: Facts = FACTS) -> str | Refused
         return Refused("invalid_slot", str(error))
 
 
-@each(("language", "template", "text"), [
+@pytest.mark.parametrize(("language", "template", "text"), [
     ("en", "The gap {trend:distance} from {distance@t0} to {distance}.", "The gap decreases from 20.0 m to 18.0 m."),
     ("en", "The gap is now {trend:distance}.", "The gap is now decreasing."),
     ("en", "The gap has {trend:distance} to {distance}.", "The gap has decreased to 18.0 m."),
@@ -88,7 +87,7 @@ REFUSED = [
 ]
 
 
-@each(("language", "text", "words"), REFUSED)
+@pytest.mark.parametrize(("language", "text", "words"), REFUSED)
 def test_a_refused_slot_names_the_fault_and_the_fix(language, text, words):
     found = filled(text, language)
     assert isinstance(found, Refused)
@@ -168,7 +167,7 @@ def drafts(english: str, chinese: str) -> Draft | Refused:
     return SLOTS.read_mirror(zh, first, FACTS, True)
 
 
-@each(("english", "chinese", "reason"), [
+@pytest.mark.parametrize(("english", "chinese", "reason"), [
     ("The gap {trend:distance} to {distance}.", "距离{trend:distance}到 {distance}。", None),
     ("With {distance} the gap {trend:distance}.", "距离{trend:distance}，为 {distance}。", None),  # another order
     ("The gap is {distance}. It should {decision}.", "距离为 {distance}，应{decision}。", "sentences"),
@@ -249,7 +248,7 @@ def test_a_failed_correction_leaves_no_checks_of_the_refused_answer(tree, tmp_pa
         assert (caption.checks.values, caption.checks.contradictions) == (None, None)
 
 
-@each(("reasons", "reason", "asks"), [
+@pytest.mark.parametrize(("reasons", "reason", "asks"), [
     ("The gap of 47.5 m calls for nothing.", "contradicted_value", 6),  # both answers share one mirror
     ("The gap of {gap} calls for this decision.", "invalid_slot", 4),
 ])  # fmt: skip
@@ -280,7 +279,7 @@ def test_the_question_shows_what_is_known_by_its_slot(tree, tmp_path):
 LEFTWARD = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, 6.0, 10.0))
 
 
-@each(("address", "fact"), [
+@pytest.mark.parametrize(("address", "fact"), [
     ("distance", Fact(18.0, "m", 1)),
     ("distance@t3", "unknown_fact"),
     ("distance@t5", "unobserved_frame"),
@@ -315,7 +314,7 @@ def test_the_fact_at_an_address(address, fact):
     assert parse_reference(str(reference)) == reference
 
 
-@each("address", [
+@pytest.mark.parametrize("address", [
     "", "colour", "distance@now", "distance@t0-t4", "trend:visibility", "side:distance", "sum:distance", "change:",
     "x" * 9,
 ])  # fmt: skip

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 from specimens_captions import VOCABULARY, report_of, saying
-from tables import each
 from teacher_server import TeacherServer, is_mirror, obedient_answer
 
 from caption.schema import CaptionConfig, JudgeConfig, RepairConfig, WindowConfig
@@ -176,7 +175,7 @@ def test_captions_of_another_prompt_are_refused_by_name(tree, tmp_path, monkeypa
 CFG = CaptionConfig(window=WindowConfig(require_images=False))
 
 
-@each("treatment", ["keep", "repair", "drop"])
+@pytest.mark.parametrize("treatment", ["keep", "repair", "drop"])
 def test_what_becomes_of_a_soft_conflict(treatment):
     flight = dataclasses.replace(make_flight(60)[0], folder=Path("nowhere"))
     windows = list(cut_windows(flight, CFG.window))
@@ -202,7 +201,7 @@ def test_what_becomes_of_a_soft_conflict(treatment):
                 assert caption.drop_reason == "no_reason"
 
 
-@each("strategy", ["anchored", "cascade"])
+@pytest.mark.parametrize("strategy", ["anchored", "cascade"])
 def test_a_conflict_without_a_reason_for_its_label_counts_as_not_repaired(strategy):
     cfg = CFG.model_copy(update={"repair": RepairConfig(hard_conflict="repair", soft_conflict="repair")})
     track = dataclasses.replace(make_flight(60)[0], folder=Path("nowhere"))
@@ -246,7 +245,7 @@ def test_a_comparison_by_hand():
     assert [one.row[:4] for one in (found, nothing)] == [("hint", "2", "33.3 %", "62.5 %"), ("hint", "0", "0.0 %", "-")]
 
 
-@each(("text", "verdict"), [
+@pytest.mark.parametrize(("text", "verdict"), [
     ('{"verdict": "FIX_LABEL", "reason": "the text argues for the label"}', "FIX_LABEL"),
     ("ACCEPT_ALTERNATIVE", UNJUDGED),
     ('{"verdict": "ACCEPT", "reason": "fine"}', UNJUDGED),

@@ -8,10 +8,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from specimens_captions import make_facts, write_answers
-from tables import each
 
 from caption.schema import FutureMotion, WindowConfig
 from caption.stage.windows import cut_windows
@@ -76,7 +76,7 @@ def pair(en: str, zh: str) -> tuple[Coc, Coc]:
     )
 
 
-@each(("en", "zh", "reason"), [
+@pytest.mark.parametrize(("en", "zh", "reason"), [
     ("the target is on the left", "目标在左侧", None),
     ("the target is on the left", "目标在右侧", "polarity_side"),
     ("the target is right now on the left", "目标此刻在左侧", None),
@@ -99,7 +99,7 @@ def test_mirror_check(en, zh, reason):
     assert check_mirror(*pair(en, zh), make_facts()) == reason
 
 
-@each(("text", "is_contradicted"), [
+@pytest.mark.parametrize(("text", "is_contradicted"), [
     ("The horizontal distance increases from 20.0 m to 21.4 m.", False),
     ("The horizontal distance decreases from 20.0 m to 21.4 m.", False),  # words are not checked
     ("The horizontal distance is 47.0 m.", True),
@@ -164,7 +164,7 @@ def test_rule_captions_are_one_record_in_two_languages():
         assert check_mirror(en, bad, facts) == "number"
 
 
-@each("decision", TOKENS)
+@pytest.mark.parametrize("decision", TOKENS)
 def test_the_rule_teacher_justifies_any_given_decision_without_contradiction(decision):
     for facts, _, _ in clean_captions(2)[::7]:
         answers = write_answers(facts, np.random.default_rng(3), decision)
@@ -247,7 +247,7 @@ LABELS = [
 ]
 
 
-@each(("motion", "label"), LABELS)
+@pytest.mark.parametrize(("motion", "label"), LABELS)
 def test_label_of_a_known_future(motion, label):
     assert TABLE.label_of(measure(future(**motion))) == label
 
@@ -283,7 +283,7 @@ HARD = [  # the opposite, then what is plainly not there
 ]
 
 
-@each(("decision", "motion"), HARD)
+@pytest.mark.parametrize(("decision", "motion"), HARD)
 def test_contradiction_of_each_action(decision, motion):
     measured = measure(future(**motion))
     label = TABLE.label_of(measured)

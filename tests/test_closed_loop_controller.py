@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from commands import invoke
 from specimens_planning import CANYON, town_of, walk_along
-from tables import each
 from test_cosfly_formats import frame, record
 
 from caption.schema import FutureMotion
@@ -63,7 +62,7 @@ def flown(begin, *tokens) -> tuple[list, Motion, Controller]:
 
 
 @pytest.mark.slow
-@each("token", [t for t in TOKENS if t != "search_to_reacquire_target"])
+@pytest.mark.parametrize("token", [t for t in TOKENS if t != "search_to_reacquire_target"])
 def test_a_decision_that_is_flown_for_its_horizon_shows_what_its_own_rule_asks_for(begin, token):
     _, motion, _ = flown(begin, *[token] * HORIZON)
     if token in ("break_off", "return_to_home"):  # orders of a mission; who leaves without one leaves the person
@@ -73,7 +72,7 @@ def test_a_decision_that_is_flown_for_its_horizon_shows_what_its_own_rule_asks_f
     assert shown(motion) >= 1.0, (token, shown(motion), motion)
 
 
-@each("command", [(99.0, 0, 0, 0, 0), (0, 0, 0, float("nan"), 0), (0, 0)])
+@pytest.mark.parametrize("command", [(99.0, 0, 0, 0, 0), (0, 0, 0, float("nan"), 0), (0, 0)])
 def test_a_command_that_cannot_be_flown_is_the_students_failure_and_the_drone_hovers(begin, command):
     flight, _, moment = begin()
     under_way = OpenEpisode("path_00000", flight, read_controls(), 1)

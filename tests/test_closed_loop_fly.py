@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from commands import invoke, working_here
 from specimens_distill import prepared
-from tables import each
 from teacher_server import TeacherServer
 
 from caption.schema import CaptionConfig
@@ -296,7 +295,7 @@ def test_redrawn_frames_show_what_the_student_saw(town, tmp_path, in_this_proces
 
 
 @pytest.mark.slow
-@each(("more", "reason"), [
+@pytest.mark.parametrize(("more", "reason"), [
     ("--set plan.safety_distance_m=25 --set plan.relaxed_safety_m=25", "too_near"),
     ("--set plan.speed_max_mps=0.2", "no_path"),
     ("", "crashes"),

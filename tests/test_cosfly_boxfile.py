@@ -264,60 +264,60 @@ def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
             load(BoxesConfig(path=tmp_path / "own.json"))
 
 
-def test_all_that_is_wrong_with_a_table_is_told(tmp_path, subtests):
-    for text, words in [
-            (PLAIN.replace("Vegetation", "vegetable").replace("Roads", "roads"),
-             r"line 3: unknown type 'vegetable'.*line 4: unknown type 'roads' \(did you mean 'Roads'\?\); expected"),
-            (PLAIN.replace(",yaw_deg", ",yaw_dge"), r"unknown column 'yaw_dge' \(did you mean 'yaw_deg'\?\)"),
-            (PLAIN.replace("type,x_m", "name,east"),
-             r"column type is missing.*unknown column 'east'.*column x_m is missing"),
-            (PLAIN.replace("height_m,yaw_deg", "height_m,z_m"), "column z_m occurs twice"),
-            (PLAIN.replace(",12,8,8,30", ",12,8,8"), "line 2: 8 cells, but the first line has 9"),
-            (PLAIN.replace("12,8,8,30", '"12,5",8,8,30'), r"length_m is not a finite number: '12,5'"),
-            (PLAIN.replace("12,8,8,30", "-12,8,8,30").replace("4,4,6,0", "4,4,nan,0"),
-             r"line 2: length_m must be above 0; line 3: height_m is not a finite number: 'nan'"),
-            (PLAIN.replace("20,4,12", "20,1e18,12"), "line 2: the box has no volume"),
-            (PLAIN.replace("10,20,4", "1e12,20,4"), "line 2: it is 1,000,000,000 km from the middle of the map"),
-            (PLAIN.replace("7,Buildings", "8,Buildings"), "ids must be different whole numbers"),
-            (PLAIN.replace("7,Buildings", "x,Buildings"), "ids must be different whole numbers"),
-            (PLAIN.replace(",", ";"), "column type is missing.*separated by commas"),
-            ("", "has no boxes"),
-            (PLAIN + "\"a", "not a CSV table"),
-        ]:  # fmt: skip
-        with subtests.test(text=text), pytest.raises(InputError, match=words):
-            loaded(tmp_path, text)
+@pytest.mark.parametrize(("text", "words"), [
+    (PLAIN.replace("Vegetation", "vegetable").replace("Roads", "roads"),
+     r"line 3: unknown type 'vegetable'.*line 4: unknown type 'roads' \(did you mean 'Roads'\?\); expected"),
+    (PLAIN.replace(",yaw_deg", ",yaw_dge"), r"unknown column 'yaw_dge' \(did you mean 'yaw_deg'\?\)"),
+    (PLAIN.replace("type,x_m", "name,east"),
+     r"column type is missing.*unknown column 'east'.*column x_m is missing"),
+    (PLAIN.replace("height_m,yaw_deg", "height_m,z_m"), "column z_m occurs twice"),
+    (PLAIN.replace(",12,8,8,30", ",12,8,8"), "line 2: 8 cells, but the first line has 9"),
+    (PLAIN.replace("12,8,8,30", '"12,5",8,8,30'), r"length_m is not a finite number: '12,5'"),
+    (PLAIN.replace("12,8,8,30", "-12,8,8,30").replace("4,4,6,0", "4,4,nan,0"),
+     r"line 2: length_m must be above 0; line 3: height_m is not a finite number: 'nan'"),
+    (PLAIN.replace("20,4,12", "20,1e18,12"), "line 2: the box has no volume"),
+    (PLAIN.replace("10,20,4", "1e12,20,4"), "line 2: it is 1,000,000,000 km from the middle of the map"),
+    (PLAIN.replace("7,Buildings", "8,Buildings"), "ids must be different whole numbers"),
+    (PLAIN.replace("7,Buildings", "x,Buildings"), "ids must be different whole numbers"),
+    (PLAIN.replace(",", ";"), "column type is missing.*separated by commas"),
+    ("", "has no boxes"),
+    (PLAIN + "\"a", "not a CSV table"),
+])  # fmt: skip
+def test_all_that_is_wrong_with_a_table_is_told(tmp_path, text, words):
+    with pytest.raises(InputError, match=words):
+        loaded(tmp_path, text)
 
 
-def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
-    for text, words in [
-            (collection(feature("LineString", [[0, 0], [1, 1]], type="Walls")),
-             "feature 1: width_m is missing, height_m is missing"),
-            (collection(feature("CurvePolygon", [], type="Walls")),
-             "feature 1: the geometry CurvePolygon is not supported; expected one of Point"),
-            (collection(feature("Polygon", [[[0, 0], [9, 0]]], type="Walls")),
-             r"feature 1: the coordinates of the Polygon are invalid; expected \[x, y\], at least four points in a ring"),
-            (collection(feature("Polygon", [[[0, 0], [9, "x"], [9, 9], [0, 0]]], type="Walls")),
-             "of the Polygon are invalid; expected"),
-            (collection(feature("Point", [5, 5], type="Vegetation", height_m=3)),
-             "feature 1: length_m is missing, width_m is missing"),
-            (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 0]]], type="Buildings")),
-             "feature 1: height_m is missing"),
-            (
-                collection(
-                    {**feature("LineString", [[0, 0], [1, 1]], type="Walls"), "id": "way/7"},
-                    feature("Point", [5, 5], type="Vegetation", name="old oak", height_m="tall"),
-                    feature("Point", [5, 5], type="house", length_m=4, width_m=4, height_m=6),
-                ),
-                r"feature 1 \(way/7\): width_m is missing, height_m is missing.*feature 2 \(old oak\): "
-                r"length_m is missing, width_m is missing, height_m is not a finite number: 'tall'"
-                r".*feature 3: unknown type 'house'.*expected .*columns .*types .*3 to fix",
-            ),
-            (collection(feature("Point", [5, 5], type="Walls", colour=3)), "unknown column 'colour'"),
-            (json.dumps({"type": "Topology"}), "not GeoJSON"),
-            (collection(), "has no boxes"),
-        ]:  # fmt: skip
-        with subtests.test(words), pytest.raises(InputError, match=words):
-            loaded(tmp_path, text, ".geojson")
+@pytest.mark.parametrize(("text", "words"), [
+    (collection(feature("LineString", [[0, 0], [1, 1]], type="Walls")),
+     "feature 1: width_m is missing, height_m is missing"),
+    (collection(feature("CurvePolygon", [], type="Walls")),
+     "feature 1: the geometry CurvePolygon is not supported; expected one of Point"),
+    (collection(feature("Polygon", [[[0, 0], [9, 0]]], type="Walls")),
+     r"feature 1: the coordinates of the Polygon are invalid; expected \[x, y\], at least four points in a ring"),
+    (collection(feature("Polygon", [[[0, 0], [9, "x"], [9, 9], [0, 0]]], type="Walls")),
+     "of the Polygon are invalid; expected"),
+    (collection(feature("Point", [5, 5], type="Vegetation", height_m=3)),
+     "feature 1: length_m is missing, width_m is missing"),
+    (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 0]]], type="Buildings")),
+     "feature 1: height_m is missing"),
+    (
+        collection(
+            {**feature("LineString", [[0, 0], [1, 1]], type="Walls"), "id": "way/7"},
+            feature("Point", [5, 5], type="Vegetation", name="old oak", height_m="tall"),
+            feature("Point", [5, 5], type="house", length_m=4, width_m=4, height_m=6),
+        ),
+        r"feature 1 \(way/7\): width_m is missing, height_m is missing.*feature 2 \(old oak\): "
+        r"length_m is missing, width_m is missing, height_m is not a finite number: 'tall'"
+        r".*feature 3: unknown type 'house'.*expected .*columns .*types .*3 to fix",
+    ),
+    (collection(feature("Point", [5, 5], type="Walls", colour=3)), "unknown column 'colour'"),
+    (json.dumps({"type": "Topology"}), "not GeoJSON"),
+    (collection(), "has no boxes"),
+])  # fmt: skip
+def test_all_that_is_wrong_with_geojson_is_told(tmp_path, text, words):
+    with pytest.raises(InputError, match=words):
+        loaded(tmp_path, text, ".geojson")
 
 
 def test_a_file_is_needed_and_known_by_its_suffix(tmp_path):

@@ -17,7 +17,6 @@ from cosfly.cli import options
 from cosfly.cli.options import Job, resolve
 from cosfly.cli.run import print_run
 from cosfly.llm.protocol import base_url
-from cosfly.pipeline.command_settings import SECTIONS
 from cosfly.pipeline.settings import RunConfig, explain, nested
 from cosfly.runtime.config import Config, load
 from cosfly.runtime.errors import ConfigError, InputError
@@ -252,9 +251,3 @@ def test_every_setting_is_explained_once_with_its_value():
     assert [setting.name for setting in explained] == names(cfg, "")
     assert all(setting.meaning for setting in explained)
     assert nested(explained) == cfg.model_dump(mode="json")
-
-
-def test_every_section_of_the_settings_is_a_model():
-    for place in SECTIONS.values():
-        module, name = place.split(":")
-        assert issubclass(getattr(importlib.import_module(module), name), Config)

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from tables import each
 
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.episodes import Episode, EpisodeFrame, episode_file, read_episode, write_episode
@@ -70,31 +69,33 @@ def a_trace():
     return DroneTrace("path_00000", "muco", T_S, m, m, m, np.ones(4), np.full(4, 5.0), {"a": 1.0}, {"b": 2}, None)
 
 
-def test_path_and_trace_round_trip(tmp_path, subtests):
-    for write, read, make, group in [
+@pytest.mark.parametrize(
+    ("write", "read", "make", "group"),
+    [
         (write_paths, read_paths, a_path, "paths"),
         (write_traces, read_traces, a_trace, "traces"),
         (write_paths, read_paths, lambda: replace(a_path(), pace="hurry"), "paths"),
         (write_traces, read_traces, lambda: replace(a_trace(), pace="hurry"), "traces"),
-    ]:
-        with subtests.test(write=write, read=read):
-            path = tmp_path / "p.json"
-            write(path, [make()], {"map": "T", "seed": 0})
-            back = read(path)[0]
-            for name, value in vars(make()).items():
-                if isinstance(value, np.ndarray):
-                    assert_allclose(getattr(back, name), value)
-                else:
-                    assert getattr(back, name) == value
-            for change, words in (
-                (lambda record: record["t"].__setitem__(1, "x"), r"t"),
-                (lambda one: one["t"].__setitem__(1, one["t"][0]), r"t: the times do not increase; got 0 s, th"),
-                (lambda record: record.get("target", record)["y"].__setitem__(1, 1e9), r".*y: a place is too far from"),
-            ):
-                write(path, [make()], {})
-                change_json(path, lambda value, change=change, group=group: change(value[group][0]))
-                with pytest.raises(InputError, match=rf"{group}\[0\].*{words}"):
-                    read(path)
+    ],
+)
+def test_path_and_trace_round_trip(tmp_path, write, read, make, group):
+    path = tmp_path / "p.json"
+    write(path, [make()], {"map": "T", "seed": 0})
+    back = read(path)[0]
+    for name, value in vars(make()).items():
+        if isinstance(value, np.ndarray):
+            assert_allclose(getattr(back, name), value)
+        else:
+            assert getattr(back, name) == value
+    for change, words in (
+        (lambda record: record["t"].__setitem__(1, "x"), r"t"),
+        (lambda one: one["t"].__setitem__(1, one["t"][0]), r"t: the times do not increase; got 0 s, th"),
+        (lambda record: record.get("target", record)["y"].__setitem__(1, 1e9), r".*y: a place is too far from"),
+    ):
+        write(path, [make()], {})
+        change_json(path, lambda value, change=change, group=group: change(value[group][0]))
+        with pytest.raises(InputError, match=rf"{group}\[0\].*{words}"):
+            read(path)
 
 
 def test_a_drawn_person_is_read_back_as_written():
@@ -117,7 +118,7 @@ def test_the_most_alike_differs_least_the_greatest_id_of_several():
     assert people.most_alike([]) == (None, None)
 
 
-@each(("field", "value"), [("top", "toga"), ("hat_color", "red"), ("figure", 3), ("bag", None)])
+@pytest.mark.parametrize(("field", "value"), [("top", "toga"), ("hat_color", "red"), ("figure", 3), ("bag", None)])
 def test_what_the_wardrobe_lacks_is_refused(field, value):
     bare = asdict(Appearance("man", "jacket", "red", "shorts", "blue"))
     with pytest.raises(InputError, match=field):
@@ -155,7 +156,7 @@ def test_a_record_is_read_as_it_was_written_and_tells_lead_and_decisions_apart(t
     assert [f.time_s for f in found.flown] == [1.5, 2.0]  # what came of the two decisions
 
 
-@each(("change", "words"), [
+@pytest.mark.parametrize(("change", "words"), [
     ({"frames": [{"time_s": 0.5}]}, "missing|required"),
     ({"ended": "tired"}, "finished"),
     ({"colour": "red"}, "[Ee]xtra"),

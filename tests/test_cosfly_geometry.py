@@ -10,7 +10,6 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from tables import each
 
 from cosfly.formats.boxes import make_box_map
 from cosfly.formats.kinds import KINDS
@@ -87,7 +86,7 @@ def surface_at(depth_m: float, kind: str = "Buildings", number: int = 7) -> View
     return View(np.full((90, 160), depth_m, np.float32), instance, np.eye(3), np.zeros(3))
 
 
-@each(
+@pytest.mark.parametrize(
     ("kinds", "is_same"),
     [(("Roads", "Roads"), True), (("Roads", "Sidewalks"), False), (("Buildings", "Buildings"), False)],
 )
@@ -121,8 +120,9 @@ def one_box(center, half_extents, rotation_deg=(0, 0, 0), kind=BUILDINGS):
     return make_box_map([center], [half_extents], [rotation_deg], [kind])
 
 
-def test_only_boxes_at_a_persons_height_block(subtests):
-    for bottom_m, top_m, kind, blocks in [
+@pytest.mark.parametrize(
+    ("bottom_m", "top_m", "kind", "blocks"),
+    [
         (0.0, 3.0, BUILDINGS, True),
         (-5.0, 0.0, BUILDINGS, False),  # ends at the ground
         (-5.0, 0.1, BUILDINGS, True),
@@ -133,11 +133,12 @@ def test_only_boxes_at_a_persons_height_block(subtests):
         (-0.2, 0.3, ROADS, False),
         (-4.0, -1.0, WATER, True),
         (0.0, 1.0, WATER, True),
-    ]:
-        with subtests.test(bottom_m=bottom_m):
-            box_map = one_box((0, 0, (bottom_m + top_m) / 2), (1, 1, (top_m - bottom_m) / 2), kind=kind)
-            assert blocks_walking(box_map).tolist() == [blocks]
-            assert occupancy(box_map).occupied.any() == blocks
+    ],
+)
+def test_only_boxes_at_a_persons_height_block(bottom_m, top_m, kind, blocks):
+    box_map = one_box((0, 0, (bottom_m + top_m) / 2), (1, 1, (top_m - bottom_m) / 2), kind=kind)
+    assert blocks_walking(box_map).tolist() == [blocks]
+    assert occupancy(box_map).occupied.any() == blocks
 
 
 @settings(max_examples=60)
@@ -240,38 +241,36 @@ def test_nearest_agrees_with_all_pairs(subtests):
                 assert ((in_reach == -1) == (expected.min(axis=1) >= 10.0)).all()
 
 
-def test_segments_agree_with_plane_clipping(subtests):
-    for inflate_m in [0.0, 2.5]:
-        with subtests.test(inflate_m=inflate_m):
-            rng = np.random.default_rng(5)
-            index = random_boxes(rng, 60)
-            starts, ends = rng.uniform(-80, 80, (2, 300, 3)) * np.array([1, 1, 0.3])
-            ends[:40, 0] = starts[:40, 0]  # along y
-            ends[40:80, :2] = starts[40:80, :2]  # upright
-            ends[80:90] = starts[80:90]  # a point
-            expected = [slow_hits(index, a, b, inflate_m).any() for a, b in zip(starts, ends, strict=True)]
-            assert 0 < sum(expected) < 300
-            np.testing.assert_array_equal(kernels.segments_hit(index, starts, ends, inflate_m), expected)
+@pytest.mark.parametrize("inflate_m", [0.0, 2.5])
+def test_segments_agree_with_plane_clipping(inflate_m):
+    rng = np.random.default_rng(5)
+    index = random_boxes(rng, 60)
+    starts, ends = rng.uniform(-80, 80, (2, 300, 3)) * np.array([1, 1, 0.3])
+    ends[:40, 0] = starts[:40, 0]  # along y
+    ends[40:80, :2] = starts[40:80, :2]  # upright
+    ends[80:90] = starts[80:90]  # a point
+    expected = [slow_hits(index, a, b, inflate_m).any() for a, b in zip(starts, ends, strict=True)]
+    assert 0 < sum(expected) < 300
+    np.testing.assert_array_equal(kernels.segments_hit(index, starts, ends, inflate_m), expected)
 
 
-def test_the_way_between_points_agrees_with_many_points_on_it(subtests):
-    for seed in range(20):
-        with subtests.test(seed=seed):
-            rng = np.random.default_rng(seed)
-            index = random_boxes(rng, 12, spread_m=20.0)
-            points = np.cumsum(rng.normal(0, 3, (30, 3)), axis=0)
-            gaps, shares, boxes = kernels.swept_distances(index, points, 100.0)
-            ends = points[:-1], points[1:]
-            between = np.linspace(0, 1, 1001)[:, None, None]
-            fine = (ends[0] * (1 - between) + ends[1] * between).reshape(-1, 3)
-            dense = slow_distances(index, fine).min(axis=1).reshape(1001, -1)
-            outside = np.maximum(dense.min(axis=0), 0.0)
-            np.testing.assert_allclose(np.maximum(gaps[:-1], 0.0), outside, atol=1e-3)
-            assert (np.maximum(gaps[:-1], 0.0) <= outside + 1e-9).all()
-            at = ends[0] + shares[:-1, None] * (ends[1] - ends[0])
-            found = slow_distances(index, at)[np.arange(len(at)), boxes[:-1]]
-            np.testing.assert_allclose(np.maximum(found, 0.0), np.maximum(gaps[:-1], 0.0), atol=1e-9)
-            assert gaps[-1] == pytest.approx(slow_distances(index, points[-1:]).min())
+@pytest.mark.parametrize("seed", range(20))
+def test_the_way_between_points_agrees_with_many_points_on_it(seed):
+    rng = np.random.default_rng(seed)
+    index = random_boxes(rng, 12, spread_m=20.0)
+    points = np.cumsum(rng.normal(0, 3, (30, 3)), axis=0)
+    gaps, shares, boxes = kernels.swept_distances(index, points, 100.0)
+    ends = points[:-1], points[1:]
+    between = np.linspace(0, 1, 1001)[:, None, None]
+    fine = (ends[0] * (1 - between) + ends[1] * between).reshape(-1, 3)
+    dense = slow_distances(index, fine).min(axis=1).reshape(1001, -1)
+    outside = np.maximum(dense.min(axis=0), 0.0)
+    np.testing.assert_allclose(np.maximum(gaps[:-1], 0.0), outside, atol=1e-3)
+    assert (np.maximum(gaps[:-1], 0.0) <= outside + 1e-9).all()
+    at = ends[0] + shares[:-1, None] * (ends[1] - ends[0])
+    found = slow_distances(index, at)[np.arange(len(at)), boxes[:-1]]
+    np.testing.assert_allclose(np.maximum(found, 0.0), np.maximum(gaps[:-1], 0.0), atol=1e-9)
+    assert gaps[-1] == pytest.approx(slow_distances(index, points[-1:]).min())
 
 
 def test_visibility_agrees_with_slow_rays():

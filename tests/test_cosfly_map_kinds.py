@@ -12,7 +12,6 @@ import pytest
 import shapely
 from benchmarks.census_town import CENSUS, census_town
 from shapely.geometry import Point, Polygon, box
-from tables import each
 
 from cosfly.formats.boxes import BoxMap, read_boxes
 from cosfly.formats.kinds import KINDS
@@ -192,7 +191,7 @@ def footprint(box_map: BoxMap, row: int, *, with_yaw: bool = True) -> Polygon:
     return shapely.affinity.rotate(box(x - size[0] / 2, y - size[1] / 2, x + size[0] / 2, y + size[1] / 2), yaw)
 
 
-@each("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_town_has_what_the_passes_and_the_walks_need(seed):
     town = load_map(MapsConfig(), seed=seed)
     kinds = set(town.counts())
@@ -228,7 +227,7 @@ def test_the_census_town_has_the_papers_counts_and_simplifies_to_a_few_thousand(
     assert cross_validate(town, result.box_map)["iou"] > 0.92  # the paper's figure
 
 
-@each(
+@pytest.mark.parametrize(
     ("given", "words"),
     [({"preset": "rivers"}, "did you mean 'river'"), ({"preset": ["park"]}, "valid string"),
         ({"num_blocks": 6}, "raise size_m")],
@@ -387,8 +386,9 @@ def footprints(**attributes: object) -> Model:
     return model
 
 
-def test_declared_heights_raise_footprints(tmp_path, subtests):
-    for attributes, height_m in (
+@pytest.mark.parametrize(
+    ("attributes", "height_m"),
+    [
         ({"measuredHeight": 9}, 9.0),
         ({"measuredHeight": "9 m"}, 9.0),
         ({"measuredHeight": {"value": 30, "uom": "m"}}, 30.0),
@@ -398,14 +398,15 @@ def test_declared_heights_raise_footprints(tmp_path, subtests):
         ({"measuredHeight": -3}, None),
         ({"measuredHeight": "high"}, None),
         ({"measuredHeight": 1e9}, None),
-    ):
-        with subtests.test(attributes):
-            box_map = load(tmp_path, document(footprints(**attributes)))
-            header, standing = box_map.header, box_map.select(box_map.kinds == KINDS["Buildings"])
-            heights = [7.5] if height_m is None else [height_m, 7.5]
-            np.testing.assert_allclose(2 * standing.half_extents[:, 2], heights)
-            assert header.dropped_objects == ({"no_height": 1} if height_m is None else {})
-            assert len(box_map.meshes.refs) == len(heights)
+    ],
+)
+def test_declared_heights_raise_footprints(tmp_path, attributes, height_m):
+    box_map = load(tmp_path, document(footprints(**attributes)))
+    header, standing = box_map.header, box_map.select(box_map.kinds == KINDS["Buildings"])
+    heights = [7.5] if height_m is None else [height_m, 7.5]
+    np.testing.assert_allclose(2 * standing.half_extents[:, 2], heights)
+    assert header.dropped_objects == ({"no_height": 1} if height_m is None else {})
+    assert len(box_map.meshes.refs) == len(heights)
 
 
 def test_units_of_a_city_model_are_used_or_refused_by_name(tmp_path, subtests):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tables import each
 
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.bystanders import Bystander, Bystanders, read_bystanders, write_bystanders
@@ -54,7 +53,7 @@ def ground_in(parts: np.ndarray) -> WalkableGround:
     return WalkableGround(grid, grid, parts, np.zeros(parts.shape, np.uint8), 0.0, costs_of(1))
 
 
-@each("start", [(0, 0), (4, 2), (6, 6)])
+@pytest.mark.parametrize("start", [(0, 0), (4, 2), (6, 6)])
 def test_goals_are_all_cells_of_the_part_at_the_wanted_distance(start):
     rng = np.random.default_rng(1)
     parts = rng.integers(0, 3, (8, 9)).astype(np.int32)
@@ -83,7 +82,7 @@ def test_the_region_of_interest_bounds_every_walk():
         assert not ((xy > 60) & (xy < 100)).all()
 
 
-@each(("ground", "columns"), [("anywhere", 300), ("surfaces", 240), ("paved", 160)])
+@pytest.mark.parametrize(("ground", "columns"), [("anywhere", 300), ("surfaces", 240), ("paved", 160)])
 def test_people_walk_where_the_settings_say(ground, columns):
     # 80 m of road, 40 m of lawn, 30 m of nothing up to a far wall; boxes of 30 m by 0.2 m.
     kinds = [ROADS, KINDS["Terrain"], BUILDINGS]
@@ -333,7 +332,7 @@ def street(*, marked: bool = False) -> BoxList:
     return boxes
 
 
-@each(("way", "marked", "counts"), [
+@pytest.mark.parametrize(("way", "marked", "counts"), [
     ([[20.25, -6.25], [20.25, 6.25]], False, (16, 0)),  # straight across, 8 m at two points a metre
     ([[20.25, -6.25], [20.25, 6.25]], True, (16, 0)),  # beside the stripes
     ([[10.25, -6.25], [10.25, 6.25]], True, (0, 16)),

@@ -10,11 +10,19 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scipy.optimize import minimize
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
-from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenario_of, town_of, walk_along, written
-from tables import each
+from specimens_planning import (
+    CANYON,
+    WORLDS,
+    assert_safe,
+    first_points,
+    scenario_of,
+    solved_by_scipy,
+    town_of,
+    walk_along,
+    written,
+)
 
 import cosfly.planners.stage as planners
 from cosfly.formats.traces import read_traces
@@ -80,7 +88,7 @@ def shaken(world):
     return points, problem, obstacles
 
 
-@each("world", ["empty", "canyon", "corner", "tower_behind"])
+@pytest.mark.parametrize("world", ["empty", "canyon", "corner", "tower_behind"])
 def test_terms_agree_with_their_definitions(world):
     points, problem, obstacles = shaken(world)
     state = loss.make_state(len(points), len(obstacles.rows))
@@ -109,7 +117,7 @@ def test_gradient_is_the_derivative_of_the_loss():
         assert gradient[i, axis] == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4, abs=1e-3)
 
 
-@each("world", WORLDS)
+@pytest.mark.parametrize("world", WORLDS)
 def test_the_loss_never_rises_and_the_flight_is_safe(world):
     scenario, obstacles = scenario_of(world)
     problem = muco.make_problem(scenario, CFG)
@@ -131,22 +139,11 @@ def test_the_end_is_within_five_percent_of_a_general_solver(world):
     problem = muco.make_problem(scenario, CFG)
     first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
     _, solver, _ = muco.optimize(first, problem, obstacles, CFG.muco)
-    state, unmasked = loss.make_state(len(first), len(obstacles.rows)), np.zeros(len(first), dtype=bool)
-
-    def loss_and_gradient(interior):
-        points = np.vstack([first[:1], interior.reshape(-1, 3), first[-1:]])
-        value = loss.evaluate(points, problem, obstacles, unmasked, state)
-        return value, (state.gradient + state.visibility_gradient)[1:-1].reshape(-1)
-
-    bounds = [(None, None), (None, None), (20.0, 100.0)] * (len(first) - 2)
-    settings = {"maxiter": 400, "maxfun": 800}
-    general = minimize(
-        loss_and_gradient, first[1:-1].reshape(-1), jac=True, method="L-BFGS-B", bounds=bounds, options=settings
-    )
+    general = solved_by_scipy(first, problem, obstacles, maxiter=400, maxfun=800)
     assert solver["loss_end"] <= 1.05 * general.fun
 
 
-@each("name", ["five_ray_mean", "accel_rms_mps2", "jerk_rms_mps3"])
+@pytest.mark.parametrize("name", ["five_ray_mean", "accel_rms_mps2", "jerk_rms_mps3"])
 def test_the_prefilter_has_three_rules_of_motion_and_sight(name):
     fine = {"five_ray_mean": 0.40, "accel_rms_mps2": 5.0, "jerk_rms_mps3": 10.0}
     assert planners.drop_reason(fine, CFG, True) is None
@@ -225,7 +222,7 @@ def cheapest_by_trying_all(places, own, longest_m, index, clearance_m, links, nu
     return cost.min()
 
 
-@each("seed", range(3))
+@pytest.mark.parametrize("seed", range(3))
 def test_no_sequence_of_places_is_cheaper(seed):
     rng, num_azimuths, obstacles = np.random.default_rng(seed), 8, random_town(seed)
     made = foresight.make_lattice(straight_scenario(obstacles, 6.0), climbing=False)
@@ -242,7 +239,7 @@ def test_no_sequence_of_places_is_cheaper(seed):
     assert cost == pytest.approx(cheapest_by_trying_all(places, own, longest_m, obstacles, 3.0, *settings))
 
 
-@each("seed", range(3))
+@pytest.mark.parametrize("seed", range(3))
 def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
     obstacles = random_town(seed)
     scenario = straight_scenario(obstacles, 60.0)
@@ -257,7 +254,7 @@ def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
     assert trajectory_metrics.derivative_rms(points, 3) <= max(0.3 * trajectory_metrics.derivative_rms(raw, 3), 0.05)
 
 
-@each(
+@pytest.mark.parametrize(
     ("place_m", "velocity_mps"),
     [((-20, 0, 20), (1.2, 0, 0)), ((45, 3, 24), (-6, 0, 2)), ((-60, 0, 30), (-9, 0, 0)), ((5, 2, 12), (0, 0, -2))],
 )
@@ -364,20 +361,6 @@ def problems(free: np.ndarray, route: np.ndarray) -> list[str]:
     return found + [f"blocked: {(x, y)}" for x, y in route.tolist() if not free[y, x]]
 
 
-def test_a_route_exists_exactly_within_a_part_of_four_neighbours():
-    rng = np.random.default_rng(8)
-    free = rng.random((30, 30)) < 0.6
-    parts, _ = connected_parts(free, 4)
-    cells = np.argwhere(free)[:, ::-1]
-    outcomes = set()
-    for _ in range(200):
-        start, goal = (tuple(cells[i].tolist()) for i in rng.integers(len(cells), size=2))
-        is_same_part = parts[start[1], start[0]] == parts[goal[1], goal[0]]
-        assert (find_route(free, start, goal) is not None) == is_same_part
-        outcomes.add(bool(is_same_part))
-    assert outcomes == {True, False}
-
-
 @settings(max_examples=80)
 @given(st.integers(0, 10**9), st.integers(1, 22), st.integers(1, 22), st.floats(0.0, 0.55), st.booleans())
 def test_costs_are_the_optimum_of_another_library(seed, num_x, num_y, density, is_uniform):
@@ -389,6 +372,8 @@ def test_costs_are_the_optimum_of_another_library(seed, num_x, num_y, density, i
     free[start[1], start[0]] = free[goal[1], goal[0]] = True
     optimum = shortest_costs(free, start, classes, costs)[goal[1], goal[0]]
     route = find_route(free, start, goal, classes, costs)
+    parts, _ = connected_parts(free, 4)
+    assert (route is not None) == (parts[start[1], start[0]] == parts[goal[1], goal[0]])
     if route is None:
         assert np.isinf(optimum)
         return

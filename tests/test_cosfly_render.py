@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from tables import each
 from test_renderers_contract import circling, pose_towards, street, write_inputs
 
 from cosfly.formats.boxes import BoxMap, make_box_map
@@ -40,24 +39,12 @@ from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import make_track_script, open_renderer, run
 from cosfly.render.track import find_goal, render_track
 from cosfly.runtime.config import build
-from cosfly.runtime.errors import ConfigError, EnvironmentMissing
+from cosfly.runtime.errors import ConfigError
 from cosfly.runtime.io import read_checksums, sha256_file
 
 CAMERA = Camera(320, 180, intrinsic_matrix(320, 180, 90.0))
 ALL_MESHES = unit_meshes.all_meshes()
 SMALL = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0, 90.0], "town": "Street", "first_timestamp": 1776000000}
-
-
-def without_gl() -> str:
-    try:
-        open_renderer("gl", make_box_map([], [], [], []), 16, 16).close()
-    except EnvironmentMissing as error:
-        return str(error)
-    return ""
-
-
-NO_GL = without_gl()
-needs_gl = pytest.mark.skipif(bool(NO_GL), reason=NO_GL)
 
 
 def test_instance_ids_are_the_boxes_own_where_they_fit():
@@ -177,7 +164,7 @@ def shaken(before: Poses, box_map: BoxMap, cfg: PerturbationConfig, seed: int = 
     return perturb(before, cameras, Surroundings(box_map), cfg, np.random.default_rng(seed))
 
 
-@each("sampling", ["cubic", "spherical"])
+@pytest.mark.parametrize("sampling", ["cubic", "spherical"])
 def test_perturbed_frames_keep_their_promises(sampling):
     cfg = PerturbationConfig(sampling=sampling)
     before, after = planned(), perturbed(cfg)
@@ -213,7 +200,7 @@ def test_perturbed_frames_keep_their_promises(sampling):
     np.testing.assert_array_equal(after.poses.rotations_deg[still], before.rotations_deg[still])
 
 
-@each("sampling", ["cubic", "spherical"])
+@pytest.mark.parametrize("sampling", ["cubic", "spherical"])
 def test_smooth_perturbations_keep_probabilities_and_radii_and_move_as_a_drone_and_a_walker_could(sampling):
     cfg = PerturbationConfig(sampling=sampling, correlation_s=6.0, max_roll_deg=4.0)
     n, dt_s = 4000, 0.5
@@ -292,7 +279,7 @@ def along_a_wall(gap_m: float) -> tuple[Poses, BoxMap]:
     return Poses(drones, rotations, targets, np.full(n, gap_m)), wall
 
 
-@each(("gap_m", "least_m"), [(12.0, 3.0), (4.0, 3.0), (3.0, 3.0), (2.5, 2.5)])
+@pytest.mark.parametrize(("gap_m", "least_m"), [(12.0, 3.0), (4.0, 3.0), (3.0, 3.0), (2.5, 2.5)])
 def test_a_whole_flight_along_a_planted_wall_keeps_the_planners_clearance(gap_m, least_m):
     """3.0 m, or as near as the plan itself where that flies at its relaxed floor of 2.5 m; far from the wall nothing
     falls back."""
@@ -307,7 +294,7 @@ def test_a_whole_flight_along_a_planted_wall_keeps_the_planners_clearance(gap_m,
     assert (careless.poses.clearances_m.min() < 2.5) == (gap_m < 6.0), "or the wall would prove nothing"
 
 
-@each(("data", "word"), [
+@pytest.mark.parametrize(("data", "word"), [
     ({"fovs_deg": []}, "fovs_deg"),
     ({"tracks": ["clean", "clean"]}, "only once"),
     ({"town": "../x"}, "letters"),
@@ -327,7 +314,6 @@ def finished(tmp_path_factory):
     return run(build(RenderConfig, SMALL, "test"), *inputs, folder / "out", seed=5), inputs
 
 
-@needs_gl
 def test_the_tree_is_complete_and_readable(finished):
     tree, _ = finished
     folders = find_tracks(tree)
@@ -346,7 +332,6 @@ def test_the_tree_is_complete_and_readable(finished):
     assert (manifest["num_traces"], manifest["num_traces_not_rendered"], manifest["num_frames"]) == (3, 1, 18)
 
 
-@needs_gl
 def test_frames_hold_what_their_annotation_says(finished):
     tree, _ = finished
     for folder in find_tracks(tree):
@@ -442,7 +427,6 @@ def test_a_walled_in_person_is_not_moved():
 LOOKS = Appearance("man", "jacket", "blue", "trousers", "red")
 
 
-@needs_gl
 @pytest.mark.parametrize(("y_m", "says_legs"), [(8.0, True), (-8.0, False)])
 def test_what_a_wall_hides_is_not_said(y_m, says_legs):
     """Two men whose trousers alone differ; to the south of them is a wall as high as their hips."""
@@ -470,8 +454,6 @@ def test_what_a_wall_hides_is_not_said(y_m, says_legs):
 @pytest.fixture(scope="session")
 def crowded_tree(built_once):
     """Two walks, both tracks, each among eight bystanders of whom four look alike the target but for one thing."""
-    if NO_GL:
-        pytest.skip(NO_GL)
     return built_once("crowd", make_crowded_tree) / "out"
 
 

@@ -295,12 +295,13 @@ def interrupted(*words: str, number: signal.Signals = signal.SIGINT) -> tuple[in
         return process.returncode, said, complained
 
 
-def test_once_ends_everything_in_order():
-    assert interrupted() == (7, ["asking", "ending", "ended"], "")
-
-
-def test_it_also_counts_while_threads_are_waited_for():
-    assert interrupted("thread") == (7, ["asking", "ended"], "")
+@pytest.mark.parametrize(("words", "number", "status", "said"), [
+    ((), signal.SIGINT, 7, ["asking", "ending", "ended"]),
+    (("thread",), signal.SIGINT, 7, ["asking", "ended"]),
+    ((), signal.SIGTERM, 128 + signal.SIGTERM, ["asking", "ending"]),
+], ids=["once", "while threads are waited for", "terminated"])  # fmt: skip
+def test_a_signal_ends_everything_in_order(words, number, status, said):
+    assert interrupted(*words, number=number) == (status, said, "")
 
 
 def test_twice_ends_the_process_in_one_line():
@@ -309,10 +310,6 @@ def test_twice_ends_the_process_in_one_line():
     assert (
         complained == "error: interrupted at once; recorded answers are kept; run the same command again to continue\n"
     )
-
-
-def test_a_request_to_terminate_ends_everything_in_order():
-    assert interrupted(number=signal.SIGTERM) == (128 + signal.SIGTERM, ["asking", "ending"], "")
 
 
 def test_without_it_all_is_as_ever():

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tables import each
 
 from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.formats.kinds import KINDS
@@ -44,7 +43,7 @@ def random_map(seed: int, count: int, size_m: float = 30.0) -> BoxMap:
     return make_box_map(centers, rng.uniform(0.2, 3.0, (count, 3)), rotations, kinds, ids)
 
 
-@each(("kind", "gap", "count"), [
+@pytest.mark.parametrize(("kind", "gap", "count"), [
     ("Vegetation", (2.0, 0, 0), 1),  # a gap equal to the threshold counts
     ("Vegetation", (2.001, 0, 0), 2),
     ("Vegetation", (0, 0, 2.5), 2),  # every axis must be near
@@ -188,7 +187,7 @@ def test_clipping_cuts_off_what_lies_below_the_ground():
     np.testing.assert_array_equal(stays.half_extents, leaning.select(leaning.maxs[:, 2] > 0).half_extents)
 
 
-@each(("inner", "kind", "kept"), [
+@pytest.mark.parametrize(("inner", "kind", "kept"), [
     (((1, 1, 1), (2, 2, 2)), "Buildings", [1]),
     (((1, 1, 1), (2, 2, 10.009)), "Buildings", [1]),  # within the tolerance of a centimetre
     (((1, 1, 1), (2, 2, 10.011)), "Buildings", [1, 2]),

@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 from commands import invoke
-from test_cosfly_render import needs_gl
 from test_renderers_contract import circling, write_inputs
 from toy_workers import make_counting_worker, stage_in
 
@@ -63,7 +62,6 @@ def test_a_longer_lens_shows_the_middle_as_large():
 
 
 @pytest.mark.slow
-@needs_gl
 def test_the_target_grows_as_the_lens_does(tmp_path_factory, in_this_process):
     folder = tmp_path_factory.mktemp("study")
     boxes, simplified, traces = write_inputs(folder / "inputs", [circling(6), circling(5, "path_002")])

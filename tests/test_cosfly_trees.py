@@ -73,9 +73,8 @@ DEMANDS = {
 }
 
 
-def test_the_public_reader_can_refuse(tmp_path, subtests, tmp_path_factory):
-    ours = make_playback_tree(tmp_path_factory.mktemp("ours"), 1, 6)
-    tree = copied(ours, tmp_path / "tree")
+def test_the_public_reader_can_refuse(tree, tmp_path, subtests):
+    tree = copied(tree, tmp_path / "tree")
     path = find_tracks(tree)[0] / "trajectory.json"
     whole = path.read_text()
     for demand, change in DEMANDS.items():

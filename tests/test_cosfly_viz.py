@@ -17,8 +17,6 @@ from commands import invoke
 from PIL import Image
 from specimens_captions import VOCABULARY
 from specimens_distill import WINDOW, make_caption
-from tables import each
-from test_cosfly_render import needs_gl
 from test_renderers_contract import DRAWN, circling, street, write_inputs
 
 from caption.schema import CaptionConfig, ImageConfig, Window, WindowConfig
@@ -248,7 +246,7 @@ def test_a_teacher_is_told_what_it_is_shown(window):
             assert {picture.shape for picture in pictures} == {(height, across * width, 3)}
 
 
-@each(("views", "layout", "max_side_px"), SHAPES)
+@pytest.mark.parametrize(("views", "layout", "max_side_px"), SHAPES)
 def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, window, views, layout, max_side_px):
     image = {"layout": layout, "max_side_px": max_side_px, "depth_range_m": 40.0}
     cfg = CaptionConfig.model_validate({"image": image, "window": {"require_images": True}})
@@ -286,7 +284,6 @@ def street_tree(tmp_path_factory) -> Path:
     return render(RenderConfig.model_validate({**DRAWN, "tracks": ["clean"]}), *inputs, folder / "render")
 
 
-@needs_gl
 def test_four_pictures_of_a_frame(street_tree, tmp_path):
     boxes = tmp_path / "boxes_3d.json"
     write_boxes(boxes, street())

@@ -10,7 +10,6 @@ import pytest
 import shapely
 from commands import invoke
 from pydantic import ValidationError
-from tables import each
 from teacher_server import TeacherServer
 
 from cosfly.maps.footprints import footprints, rectangle_polygon
@@ -42,7 +41,7 @@ def assert_houses_stand_apart_at_pavements(town: Town) -> None:
 
 
 @pytest.mark.slow
-@each("row", PROMPTS, ids=[row["name"] for row in PROMPTS])
+@pytest.mark.parametrize("row", PROMPTS, ids=[row["name"] for row in PROMPTS])
 def test_a_prompt_gives_a_valid_world_with_each_named_object(row):
     plan = by_rules(row["prompt"])
     town = build(plan, "W", 0)
@@ -111,7 +110,7 @@ def test_what_a_prompt_says_there_is_none_of_is_not_there():
     assert [one.name for one in by_rules("a village, no fountain but a well").objects] == ["well"]
 
 
-@each("prompt", ["asdf qwer zxcv", "42", "棋盘式的城市", "a village, 村庄"])
+@pytest.mark.parametrize("prompt", ["asdf qwer zxcv", "42", "棋盘式的城市", "a village, 村庄"])
 def test_a_prompt_that_cannot_be_read_is_refused_and_a_chinese_one_in_chinese(prompt):
     english = r"rule-based planner recognises no word.*expected an English.*--planner URL"
     chinese = r"只读英文描述.*a small village.*用英文写这段描述, 或用 --planner URL"
@@ -119,8 +118,8 @@ def test_a_prompt_that_cannot_be_read_is_refused_and_a_chinese_one_in_chinese(pr
         by_rules(prompt)
 
 
-@each(
-    "prompt, pattern, settlement",
+@pytest.mark.parametrize(
+    ("prompt", "pattern", "settlement"),
     [
         ("Manhattan with wide avenues", "grid", "downtown"),
         ("a city with 6 avenues that meet at a roundabout", "radial", "city"),

@@ -9,15 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import invoke
 from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions, prepared
-from specimens_release import CFG, DROPPED, build, make_inspection, release_of
-from tables import each
+from specimens_release import DROPPED, release_of
 
 from cosfly.formats.captions import read_captions, write_captions
 from cosfly.formats.frames import frame_name
-from cosfly.formats.inspection import write_inspection
 from cosfly.formats.playback import Track
 from cosfly.formats.playback_file import read_track
 from cosfly.geometry.splits import SPLITS
@@ -135,13 +132,10 @@ def test_a_sample_has_the_past_of_its_own_frames(tree, captions, tmp_path):
         np.testing.assert_allclose(sample.past, past, atol=1e-4)
 
 
-def test_a_set_without_pictures_needs_no_trees(tree, captions, tmp_path, monkeypatch):
+def test_a_set_without_pictures_needs_no_trees(tree, captions, tmp_path):
     out = prepared(tree, captions, tmp_path / "set", modalities=())
     assert "no pictures" in (out / "README.md").read_text()
     assert resolve_trees(out, []) == {}
-    monkeypatch.chdir(tmp_path)  # no run directory
-    done = invoke("distill infer --model nothing --engine transformers --out answers --dataset", out)
-    assert "student model" in str(done.exception), done.exception  # which is asked for after the trees
 
 
 def test_run_counts_what_it_leaves_out(tree, tmp_path):
@@ -259,7 +253,9 @@ def run(four_walks: Path, out: Path, **settings: object) -> Path:
     return dual_track.run(DualTrackConfig.model_validate(settings), [four_walks], out)
 
 
-@each(("num_frames", "expected"), [(9, []), (10, [0]), (12, [0]), (13, [0, 3]), (170, 54), (200, 64)])
+@pytest.mark.parametrize(
+    ("num_frames", "expected"), [(9, []), (10, [0]), (12, [0]), (13, [0, 3]), (170, 54), (200, 64)]
+)
 def test_the_papers_windows(num_frames, expected):
     """Windows of 10 frames, one every 3: (N - 10) / 3 + 1, which the paper calls 50 to 60 of 170 to 200 frames."""
     found = list(windows_of(num_frames, DualTrackConfig()))
@@ -387,11 +383,8 @@ def test_pytorch_loads_them_with_two_workers(place):
 
 
 def test_frames_are_scaled_to_the_size_that_pixels_in_the_texts_refer_to(place, tmp_path):
-    small = [caption.model_copy(update={"picture_px": (48, 27)}) for caption in read_captions(place / "captions.jsonl")]
     (tmp_path / "tree").symlink_to(place / "tree")
-    write_captions(tmp_path / "captions.jsonl", small)
-    write_inspection(tmp_path / "inspect.json", make_inspection(place / "tree", {}))
-    build(tmp_path, tmp_path / "release", CFG.model_copy(update={"selection": "all"}))
+    release_of(tmp_path, picture_px=(48, 27), selection="all")
     assert WindowDataset(tmp_path / "release")[0]["frames"].shape == (5, 3, 27, 48)
 
 

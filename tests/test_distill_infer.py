@@ -8,26 +8,15 @@ from pathlib import Path
 import pytest
 from commands import invoke
 from PIL import Image
-from specimens_distill import make_captions, prepared
+from specimens_distill import prepared
 from teacher_server import TeacherServer, kept_answers
 
 from cosfly.formats.predictions import read_predictions
 from cosfly.runtime.errors import TeacherError
 from distill.inference import stage as infer
 from distill.schema import open_split
-from specimens import make_playback_tree
 
 ENDPOINT = {"max_tries": 1, "timeout_s": 60.0, "concurrency": 3}
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("place")
-    tree = make_playback_tree(root / "tree", 3, 8, with_augmented=False)
-    make_captions(root / "captions.jsonl", tree)
-    shares = {"val_fraction": 0.3, "test_fraction": 0.3}
-    prepared(tree, root / "captions.jsonl", root / "set", modalities=("rgb", "depth"), **shares)
-    return root
 
 
 def settings(**changes) -> infer.InferConfig:

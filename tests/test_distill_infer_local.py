@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 from commands import invoke
-from specimens_distill import ADAPTER_PIXELS, make_adapter, make_captions, prepared
-from specimens_students import features_of
+from specimens_distill import ADAPTER_PIXELS, make_adapter
+from specimens_students import features_of, make_place
 from teacher_server import kept_answers
 
 from cosfly.formats.predictions import Prediction, read_predictions
@@ -19,8 +19,6 @@ from distill.inference import stage as infer
 from distill.inference.answers import generate
 from distill.schema import Sample, open_split, resolve_trees
 from distill.student.model import load_student
-from distill.student.random_student import make_random_student
-from specimens import make_playback_tree
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -29,11 +27,7 @@ NUM_TOKENS = 12
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("local")
-    tree = make_playback_tree(root / "tree", num_flights=3, num_points=8)
-    make_captions(root / "captions.jsonl", tree)
-    prepared(tree, root / "captions.jsonl", root / "set", modalities=("rgb", "depth"))
-    make_random_student(root / "student", seed=1)
+    root = make_place(tmp_path_factory.mktemp("local"), modalities=("rgb", "depth"))
     make_adapter(root / "student", root / "trained" / "adapter")
     return root
 

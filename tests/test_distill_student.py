@@ -112,6 +112,7 @@ def test_prompt_answer_and_end_are_the_whole_chat(place, processor):
         assert prompt.endswith("<|im_start|>assistant\n<think>\n\n</think>\n\n")  # the thought is over before it begins
         assert "Reasoning effort" not in prompt
         assert prompt.count("<|image_pad|>") == len(sample.images) == 5
+        assert all(f"t{i}:<|vision_start|><|image_pad|>" in prompt for i in range(5))
         row = processor.encode(sample)
         taught = processor.tokenizer.decode([*row.prompt_ids, *row.answer_ids])
         pictures = "<|image_pad|>" * 2  # 64 x 36 px, which the processor rounds to two squares of 32 px

@@ -9,7 +9,6 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 from later import safetensors, torch
 from processes import is_running, wait_until
@@ -34,12 +33,10 @@ from cosfly.runtime.errors import ConfigError
 from distill.inference import stage as infer
 from distill.student import features
 from distill.student import model as student
-from distill.student.chat import IGNORED, padded
-from distill.student.random_student import END_OF_TURN
 from distill.training import fit, loading
 from distill.training import stage as train
-from distill.training.checkpoints import Progress, load_checkpoint, newest_checkpoint
-from distill.training.fit import count_steps, judged, steps_from
+from distill.training.checkpoints import load_checkpoint, newest_checkpoint
+from distill.training.fit import count_steps, steps_from
 from distill.training.loading import TrainingContext
 from distill.training.settings import TrainConfig
 
@@ -51,54 +48,6 @@ def trained(place, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("trained")
     run(place, out, keep="last")  # which validation is the best depends on rounding
     return out
-
-
-def test_processor_agrees_with_the_library_one(place):
-    from transformers import Qwen3VLProcessor
-
-    class WithoutVideos(Qwen3VLProcessor):
-        @classmethod
-        def get_attributes(cls):
-            return ["image_processor", "tokenizer"]
-
-        def check_argument_for_proper_class(self, name, argument):
-            return None if argument is None else super().check_argument_for_proper_class(name, argument)
-
-    own, sample = load(place), samples_of(place)[0]
-    images = own.library.image_processor
-    oracle = WithoutVideos(images, own.tokenizer, None, chat_template=own.tokenizer.chat_template)
-    frames = []
-    pictures = [sample.pictures.read(place / "tree" / frame)[0] for frame in sample.frames]
-    for number, picture in enumerate(pictures):
-        frames += [{"type": "text", "text": f"t{number}:"}, {"type": "image", "image": picture}]
-    messages = [
-        {"role": "system", "content": [{"type": "text", "text": sample.prompt.system}]},
-        {"role": "user", "content": [*frames, {"type": "text", "text": sample.prompt.user}]},
-    ]
-    wanted = oracle.apply_chat_template(
-        messages, add_generation_prompt=True, tokenize=True, return_dict=True, return_tensors="pt"
-    )
-    found = inputs_of(own, [sample], trees_of(place))
-    for name in ("input_ids", "pixel_values", "image_grid_thw"):
-        assert torch.equal(found[name], wanted[name]), name
-
-
-def test_mask_covers_exactly_the_answer(place):
-    own = load(place)
-    samples = samples_of(place)[:2]  # one in each language
-    rows = [own.encode(sample) for sample in samples]
-    batch = padded(own, rows)
-    ids, labels = batch["input_ids"], batch["labels"]
-    for i, sample in enumerate(samples):
-        counted = labels[i] != IGNORED
-        assert own.tokenizer.decode(ids[i][counted]) == sample.answer + END_OF_TURN
-        assert np.array_equal(ids[i][counted], labels[i][counted])
-        places = counted.nonzero()[0].tolist()
-        assert places == list(range(places[0], places[-1] + 1))
-        before = own.tokenizer.decode(ids[i][: places[0]])
-        assert before.endswith("<|im_start|>assistant\n")
-        assert sample.prompt.user in before
-        assert len(rows[i]) == places[-1] + 1
 
 
 def test_each_epoch_sees_each_sample_once():
@@ -267,16 +216,6 @@ def test_bfloat16_computes_with_float32_weights_that_learn(place, tmp_path):
     newest = sorted((tmp_path / "bfloat16" / "checkpoints").iterdir())[-1]
     weights = safetensors.load_file(newest / "weights.safetensors")
     assert {tensor.dtype for tensor in weights.values()} == {torch.float32}
-
-
-def test_the_best_has_the_lowest_loss_and_patience_ends():
-    progress, cfg, found = Progress(), TrainConfig(patience=2), []
-    for step, loss in enumerate([3.0, 2.0, 1.0, 1.5, 1.25], 1):
-        progress = judged(progress.model_copy(update={"step": step}), loss, cfg)
-        found.append((progress.best_step, progress.stale, progress.has_ended))
-    assert found == [(1, 0, False), (2, 0, False), (3, 0, False), (3, 1, False), (3, 2, True)]
-    patient = TrainConfig(patience=0)
-    assert not judged(Progress(step=9, best_loss=0.5, stale=7), 1.0, patient).has_ended
 
 
 @pytest.mark.slow

@@ -14,14 +14,12 @@ import os
 import sys
 import threading
 import time
-from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
 from specimens_captions import settings
-from specimens_distill import make_captions, prepared
-from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror, kept_answers
+from teacher_server import CHINESE, ENGLISH, is_mirror, kept_answers
 
 from caption.schema import CaptionConfig
 from caption.stage import window_loop
@@ -30,18 +28,15 @@ from caption.teachers import teacher
 from caption.teachers.teacher import make_engine
 from cosfly.formats.captions import Usage, read_captions
 from cosfly.formats.predictions import read_predictions
-from cosfly.llm.answer_text import answer_schema, parse_answer
+from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.answers import Answer, AnswerBook, KeptAnswers
-from cosfly.llm.client import ChatClient, EndpointConfig
-from cosfly.llm.contract import NoAnswer, Reply, Request, started
+from cosfly.llm.client import EndpointConfig
+from cosfly.llm.contract import Reply, Request, started
 from cosfly.llm.vllm_engine import VllmEngine
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, StorageError, TeacherError
 from cosfly.runtime.journal import Journal
 from distill.inference import stage as infer
 from distill.schema import open_split
-from specimens import make_playback_tree
-
-SAMPLING = EndpointConfig(max_tries=1, max_tokens=64)
 
 
 class PlainEngine:
@@ -67,74 +62,24 @@ class PlainEngine:
         self.num_closed += 1
 
 
-@contextmanager
-def endpoint():
-    fault = lambda number, body: "413" if "refuse me" in json.dumps(body) else None  # noqa: E731
-    with TeacherServer(fault, decision=lambda body: "track_straight") as server:
-        yield ChatClient(server.url, SAMPLING)
+def test_what_is_kept_or_asked_by_another_is_not_asked_again(tmp_path):
+    engine, messages = PlainEngine(), [{"role": "user", "content": [{"type": "text", "text": "go"}]}]
+    request = EndpointConfig().request(messages, [], answer_schema(), 0)
 
-
-def request_of(text: str, seed: int = 0) -> Request:
-    return SAMPLING.request([{"role": "user", "content": [{"type": "text", "text": text}]}], [], answer_schema(), seed)
-
-
-def test_many_requests_at_once_are_answered_each_by_its_own():
-    async def ask(engine) -> list[Reply]:
-        async with started(engine):
-            assert engine.model
-            return await asyncio.gather(*(engine.answer(request_of("go", seed)) for seed in range(12)))
-
-    with endpoint() as engine:
-        replies = asyncio.run(ask(engine))
-    assert len(replies) == 12
-    assert all(parse_answer(reply.text).coc is not None for reply in replies)
-    assert all(reply.usage == Usage(prompt_tokens=1000, completion_tokens=100) for reply in replies)
-    assert all(reply.structured == "json_schema" and reply.finish_reason == "stop" for reply in replies)
-
-
-def test_a_request_that_gets_no_answer_costs_no_other():
-    async def ask(engine):
-        async with started(engine):
-            return await asyncio.gather(
-                engine.answer(request_of("refuse me")), engine.answer(request_of("go")), return_exceptions=True
-            )
-
-    with endpoint() as engine:
-        refused, answered = asyncio.run(ask(engine))
-    assert isinstance(refused, NoAnswer)
-    assert refused.is_final
-    assert isinstance(answered, Reply)
-
-
-def test_what_is_kept_is_not_asked_again(tmp_path):
-    async def ask(engine) -> list[Reply]:
+    async def ask() -> list[Reply]:
         async with started(engine):
             replies = []
             for _ in range(2):
                 with AnswerBook(tmp_path / "answers") as book:
                     kept = KeptAnswers(engine, book)
-                    replies.append(await kept.ask(request_of("go"), "flight", "flight_frame_00004", "free/0"))
+                    asked = [kept.ask(request, "flight", f"flight_frame_{i:05d}", "judge") for i in range(5)]
+                    replies += await asyncio.gather(*asked)
             return replies
 
-    with endpoint() as engine:
-        first, second = asyncio.run(ask(engine))
-    assert first == second
-    [record] = kept_answers(tmp_path)
-    assert (record["model"], record["sample_id"], record["purpose"]) == (engine.model, "flight_frame_00004", "free/0")
-
-
-def test_two_that_ask_the_same_at_once_pay_once(tmp_path):
-    engine = PlainEngine()
-
-    async def ask() -> list[Reply]:
-        async with started(engine):
-            with AnswerBook(tmp_path / "answers") as book:
-                kept = KeptAnswers(engine, book)
-                asked = [kept.ask(request_of("go"), "flight", f"flight_frame_{i:05d}", "judge") for i in range(5)]
-                return await asyncio.gather(*asked)
-
     assert len(set(asyncio.run(ask()))) == 1
-    assert engine.num_answers == len(kept_answers(tmp_path)) == 1
+    [record] = kept_answers(tmp_path)
+    assert (record["model"], record["sample_id"], record["purpose"]) == ("plain-1", "flight_frame_00000", "judge")
+    assert engine.num_answers == 1
 
 
 def answer_of(key: str) -> Answer:
@@ -400,16 +345,13 @@ def test_an_answer_that_the_engine_gave_up_is_none(stand_in, tree, model, tmp_pa
     assert len(list(read_captions(run(vllm_settings(model), tree, tmp_path / "out")))) == 5
 
 
-def test_a_student_answers_in_the_same_engine(stand_in, tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 3, 8, with_augmented=False)
-    make_captions(tmp_path / "captions.jsonl", tree)
-    training_set = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
+def test_a_student_answers_in_the_same_engine(stand_in, place, tmp_path):
     student = tmp_path / "student"
     student.mkdir()
     (student / "config.json").write_text(json.dumps({"model_type": "qwen3_5"}))
     (student / "model.safetensors").touch()
     cfg = infer.InferConfig(split="train", engine="vllm", constrained=True)
-    predictions = read_predictions(infer.run(cfg, training_set, [tree], student, tmp_path / "out"))
-    assert len(predictions) == len(stand_in.asked) == len(list(open_split(training_set, "train")))
+    predictions = read_predictions(infer.run(cfg, place / "set", [place / "tree"], student, tmp_path / "out"))
+    assert len(predictions) == len(stand_in.asked) == len(list(open_split(place / "set", "train")))
     assert all(prediction.coc is not None for prediction in predictions)
     assert stand_in.templates == [{"enable_thinking": False}] * len(predictions)

@@ -308,11 +308,6 @@ def forged(model: type[BaseModel], honest: BaseModel, least: int) -> BaseModel:
 
 
 @pytest.fixture(scope="module")
-def tree(tmp_path_factory) -> Path:
-    return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 12, width_px=64, height_px=36)
-
-
-@pytest.fixture(scope="module")
 def inspection(tree, tmp_path_factory) -> Path:
     from cosfly.inspection.settings import InspectConfig
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from specimens_planning import CANYON, WORLDS, assert_safe, town_of, walk_along, written
-from tables import each
 
 from cosfly.formats.frames import Camera
 from cosfly.formats.traces import read_traces
@@ -39,13 +38,8 @@ EACH_PLANNER = pytest.mark.parametrize(
 
 
 @EACH_PLANNER
-def test_a_flight_is_whole_safe_and_smooth_and_sees_the_target_it_looks_at(name, subtests):
-    for world in ALL:
-        with subtests.test(world=world):
-            check_flight(name, world)
-
-
-def check_flight(name: str, world: str) -> None:
+@pytest.mark.parametrize("world", ALL)
+def test_a_flight_is_whole_safe_and_smooth_and_sees_the_target_it_looks_at(name, world):
     box_map, corners = ALL[world]
     walk, up = walk_along(world, corners), np.array([0.0, 0.0, UP_M * (world in ON_A_HILL)])
     walk = replace(walk, positions_m=walk.positions_m + up)
@@ -103,13 +97,8 @@ def test_the_same_seed_gives_the_same_flight_and_inputs_stay_as_they_are(name):
 
 
 @EACH_PLANNER
-def test_the_time_step_is_the_pedestrians(name, subtests):
-    for dt_s in (0.25, 1.0):
-        with subtests.test(dt_s=dt_s):
-            check_time_step(name, dt_s)
-
-
-def check_time_step(name: str, dt_s: float) -> None:
+@pytest.mark.parametrize("dt_s", [0.25, 1.0])
+def test_the_time_step_is_the_pedestrians(name, dt_s):
     box_map, corners = WORLDS["canyon"]
     walk = walk_along("w", corners, dt_s=dt_s)
     cfg = PlanConfig(planner=name, speed_max_mps=3.0)
@@ -122,7 +111,7 @@ def check_time_step(name: str, dt_s: float) -> None:
     assert trace.metrics["accel_rms_mps2"] == pytest.approx(np.sqrt((accel**2).mean()), abs=1e-3)
 
 
-@each("name", ALL_PLANNERS)
+@pytest.mark.parametrize("name", ALL_PLANNERS)
 def test_where_there_is_no_way_it_says_so(name):
     roof = kernels.obstacle_index(town_of(((0, 0, 60), (300, 300, 50))))
     scenario = make_scenario(walk_along("w", [(0, 0), (50, 0)]), roof, PlanConfig())

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from specimens_planning import WORLDS, assert_safe, town_of, walk_along
-from tables import each
 
 from caption.schema import FutureMotion
 from caption.verification.actions import TABLE as ACTION_TABLE
@@ -67,7 +66,7 @@ def labels_of(trace):
     return Counter(found)
 
 
-@each("name", TABLE)
+@pytest.mark.parametrize("name", TABLE)
 def test_a_style_shows_the_decisions_that_it_is_for(name):
     counts = Counter()
     for seed in range(3):
@@ -116,7 +115,7 @@ def test_parts_draw_their_styles_and_cover_the_flight():
     assert trace.segments[-1].end == len(trace.time_s)
 
 
-@each("planner", ["muco", "foresight", "track_astar"])
+@pytest.mark.parametrize("planner", ["muco", "foresight", "track_astar"])
 def test_an_orbit_is_flown_at_the_requested_distance(planner):
     """TA*+Smooth moves by one voxel a layer: it cuts fast orbits, which are not held, and holds slower ones."""
     at = {"style_ranges": {"orbit_left": {"ground_distance_m": (14.5, 14.5), "altitude_m": (12.0, 12.0)}}}

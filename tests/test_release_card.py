@@ -13,7 +13,6 @@ import pytest
 from commands import invoke
 from hypothesis import given
 from hypothesis import strategies as st
-from tables import each
 from test_cosfly_render import crowded_tree  # noqa: F401
 
 from cosfly.formats.frames import (
@@ -93,7 +92,7 @@ def test_values_added_in_pieces_give_the_same_sum(values, cut):
     assert Sum.all([Sum.of(values[:cut]), Sum.of(values[cut:])]) == Sum.of(values)
 
 
-@each(("forward", "left", "up", "turn", "expected"), [
+@pytest.mark.parametrize(("forward", "left", "up", "turn", "expected"), [
     (1.0, 0.2, 0.0, 30.0, "forward"), (-1.0, 0.2, 0.0, 0.0, "backward"), (0.1, -0.4, 0.0, 0.0, "right"),
     (0.1, 0.2, 0.5, 0.0, "up"), (0.1, 0.1, 0.0, 6.0, "turn left"), (0.0, 0.0, 0.0, -6.0, "turn right"),
     (0.1, 0.1, 0.0, 2.0, "hover"),
@@ -149,7 +148,7 @@ def test_the_stride_is_that_of_the_paper(num_points, num_frames):
         assert chosen.tolist() == [k * (num_points - 1) // (num_frames - 1) for k in range(num_frames)]
 
 
-@each(("num_points", "num_frames", "window", "expected"), [
+@pytest.mark.parametrize(("num_points", "num_frames", "window", "expected"), [
     (10, 4, 1, [0, 3, 6, 9]),
     (5, 3, 1, [0, 2, 4]),
     (7, 1, 1, [3]),

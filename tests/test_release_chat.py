@@ -130,9 +130,8 @@ DISK_BYTES = 1_000  # the largest file that the system permits
 def test_a_release_without_captions_is_refused(tmp_path, format):
     make_playback_tree(tmp_path / "tree", 1, 4, width_px=96, height_px=54)  # too short for a window
     dataset = release_of(tmp_path)
-    with pytest.raises(CosflyError, match="no caption to export") as caught:
+    with pytest.raises(CosflyError, match="no caption to export"):
         exported(dataset, tmp_path / "out", format)
-    assert "\n" not in str(caught.value)
     assert not (tmp_path / "out" / format).exists()
 
 
@@ -140,9 +139,8 @@ def test_a_release_without_captions_is_refused(tmp_path, format):
 def test_what_is_not_a_release_is_refused(two_splits, tmp_path, format):
     run = tmp_path / "run"
     shutil.copytree(two_splits.parents[1] / "tree", run / "render")
-    with pytest.raises(InputError, match=r"the folder is not a release.*cosfly release build") as caught:
+    with pytest.raises(InputError, match=r"the folder is not a release.*cosfly release build"):
         exported(run, tmp_path / "out", format)
-    assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
 
 
@@ -161,9 +159,8 @@ def full_disk() -> Iterator[None]:
 def test_a_full_disk_leaves_nothing_half_written(two_splits, tmp_path, format, monkeypatch):
     monkeypatch.setattr(sys, "dont_write_bytecode", True)  # a module imported now would be cut in __pycache__
     out = tmp_path / "out"
-    with full_disk(), pytest.raises(StorageError, match="the file cannot be written") as caught:
+    with full_disk(), pytest.raises(StorageError, match="the file cannot be written"):
         exported(two_splits, out, format)
-    assert "\n" not in str(caught.value)
     assert not (out / format).exists()
     assert list(out.rglob("*.partial")) == []
     assert (exported(two_splits, out, format) / "README.md").is_file()

@@ -9,13 +9,14 @@ double precision, so their town lies kilometres from the origin, where that show
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import pytest
+from commands import working_here
 from conftest import SHARED_DATA
 from release_lies import Lie, Row, box_moved, captioned, ids_of_things_exchanged
 from release_tampering import depth_of, errors_in, forge, set_depth
@@ -133,47 +134,10 @@ KINDS = {
 }  # fmt: skip
 
 
-def stages(cfg: RunConfig, out: Path) -> list[pipeline.Stage]:
-    with mock.patch.object(pipeline, "worker_options", return_value={"workers": 0}):
-        return pipeline.stages(cfg, out)
-
-
 def work(stages: list[pipeline.Stage]) -> None:
-    for stage in stages:
-        stage.work()
-
-
-class Runs:
-    def __init__(self, root: Path, names: dict[str, str]) -> None:
-        self._root, self._names = root, names
-        self._made = dict[str, Path]()
-
-    def settings(self, map_name: str, told: list[str]) -> RunConfig:
-        config, own = MAPS[map_name]
-        texts = [*SHORT, *own, *told]
-        for name, value in self._names.items():
-            texts = [text.replace(name, value) for text in texts]
-        return load(RunConfig, None if config is None else CONFIGS / f"{config}.yaml", texts)
-
-    def made(self, kind: str) -> Path:
-        if kind not in self._made:
-            self._made[kind] = self._make(kind, *KINDS[kind])
-        return self._made[kind]
-
-    def _make(self, kind: str, map_name: str, told: list[str]) -> Path:
-        shared, out = self._root / f"map_{map_name}", self._root / kind.replace(" ", "_")
-        if not shared.exists():
-            work(stages(self.settings(map_name, []), shared)[: len(SHARED_STAGES)])
-        for name in SHARED_STAGES:
-            shutil.copytree(shared / name, out / name, copy_function=os.link)
-        cfg = self.settings(map_name, told)
-        if not kind.endswith("without captions"):
-            work(stages(cfg, out))
-            return out / "release/dataset"
-        work(stages(cfg, out)[:-2])
-        write_captions(out / "none.jsonl", [])
-        source = Source.of_files(out / "render", out / "none.jsonl", out / "inspect/inspect.json")
-        return package.run(cfg.release, [source], out / "release")
+    with working_here():
+        for stage in stages:
+            stage.work()
 
 
 def far_town() -> BoxMap:
@@ -182,22 +146,49 @@ def far_town() -> BoxMap:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory) -> Iterator[Runs]:
+def made(tmp_path_factory) -> Iterator[Callable[[str], Path]]:
+    """Return a function that makes the release of a kind once."""
     if not SHARED_DATA.is_dir():
         pytest.skip(f"the real maps are not here: {SHARED_DATA}")
     town, root = far_town(), tmp_path_factory.mktemp("honest")
+    names = {"DATA": str(SHARED_DATA)}
+
+    def settings(map_name: str, told: list[str]) -> RunConfig:
+        config, own = MAPS[map_name]
+        texts = [*SHORT, *own, *told]
+        for name, value in names.items():
+            texts = [text.replace(name, value) for text in texts]
+        return load(RunConfig, None if config is None else CONFIGS / f"{config}.yaml", texts)
+
+    @cache
+    def make(kind: str) -> Path:
+        map_name, told = KINDS[kind]
+        shared, out = root / f"map_{map_name}", root / kind.replace(" ", "_")
+        if not shared.exists():
+            work(pipeline.stages(settings(map_name, []), shared)[: len(SHARED_STAGES)])
+        for name in SHARED_STAGES:
+            shutil.copytree(shared / name, out / name, copy_function=os.link)
+        cfg = settings(map_name, told)
+        if not kind.endswith("without captions"):
+            work(pipeline.stages(cfg, out))
+            return out / "release/dataset"
+        work(pipeline.stages(cfg, out)[:-2])
+        write_captions(out / "none.jsonl", [])
+        source = Source.of_files(out / "render", out / "none.jsonl", out / "inspect/inspect.json")
+        return package.run(cfg.release, [source], out / "release")
+
     with (
         TeacherServer() as teacher,
         serving(town, root / "carla") as carla,
         serving(town, root / "unrealcv", protocol="unrealcv") as unrealcv,
     ):
-        names = {"CARLA_PORT": str(carla), "UNREALCV_PORT": str(unrealcv)}
-        yield Runs(root, names | {"DATA": str(SHARED_DATA), "TEACHER": teacher.url})
+        names |= {"CARLA_PORT": str(carla), "UNREALCV_PORT": str(unrealcv), "TEACHER": teacher.url}
+        yield make
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_honest_release_verifies(runs, kind):
-    report = verify(runs.made(kind), reader=read_released)
+def test_an_honest_release_verifies(made, kind):
+    report = verify(made(kind), reader=read_released)
     assert report.is_ok, str(report)
 
 
@@ -225,13 +216,13 @@ SEALED = {
 }  # fmt: skip
 
 
-def test_sealed_lies_about_real_maps_are_found(runs, tmp_path):
+def test_sealed_lies_about_real_maps_are_found(made, tmp_path):
     """The lies of release_lies.py are about a synthetic town; these are about cities, and of depths that are wrong
     everywhere by little."""
     missed = [
         f"{kind}: {name}"
         for kind in ("simworld 160 px", "delft 160 px", "town", "CARLA", "UnrealCV")
         for name, lie in SEALED.items()
-        if not errors_in(forge(runs.made(kind), tmp_path / "forged", lie))
+        if not errors_in(forge(made(kind), tmp_path / "forged", lie))
     ]
     assert missed == []

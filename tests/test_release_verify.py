@@ -3,9 +3,7 @@
 import math
 import os
 import shutil
-import struct
 import zlib
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +15,8 @@ from release_lies import LIES, at, captioned, change, everything, put
 from release_tampering import depth_of, errors_in, forge, read_all, set_depth
 from specimens_foreign import hub_snapshot
 from specimens_png import png_around
-from tables import each
 
 from caption.stage.released import read_released
-from cosfly.formats.frames import instance_bytes
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import read_json
@@ -45,7 +41,7 @@ def dataset(honest, tmp_path) -> Path:
     return shutil.copytree(honest, tmp_path / "dataset")
 
 
-@each("level", ["structure", "rows", "pixels"])
+@pytest.mark.parametrize("level", ["structure", "rows", "pixels"])
 def test_an_honest_release_passes(honest, level):
     report = verify(honest, level=level, reader=read_released)
     assert report.is_ok, str(report)
@@ -76,7 +72,7 @@ def test_processes_find_what_one_finds(honest, tmp_path):
     assert str(one) == str(two)
 
 
-@each(("add", "expected"), [
+@pytest.mark.parametrize(("add", "expected"), [
     (lambda place: place.symlink_to("/etc/hostname"), {"unreadable": 1}),
     (lambda place: write_bytes(place / "more.bin", b"anything"), {"unexpected": 1}),
     (os.mkfifo, {"unreadable": 1}),
@@ -138,16 +134,10 @@ def _seed_of_other_splits(record: dict) -> int:
 
 
 @pytest.mark.slow
-@each("name", RECORD_LIES)
+@pytest.mark.parametrize("name", RECORD_LIES)
 def test_a_lie_of_the_record_is_found(honest, tmp_path, name):
     forged = forge(honest, tmp_path / "forged", change_record=RECORD_LIES[name])
     assert errors_in(forged, "rows"), name
-
-
-def large_array() -> bytes:
-    """A float32 array of 4 TB, by its header."""
-    header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (1000000, 1000000), }"
-    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
 
 
 def shard_of(folder: Path) -> Path:
@@ -205,12 +195,6 @@ def test_hostile_files_are_findings_and_no_traceback(dataset, name):
         assert errors_in(dataset, level)
 
 
-def double_depth() -> bytes:
-    buffer = BytesIO()
-    np.save(buffer, np.full((90, 160), 7.0))
-    return buffer.getvalue()
-
-
 def picture(column: str, data: bytes):
     if column == "depth":
         return put(at(everything, 2), depth=data)
@@ -220,15 +204,10 @@ def picture(column: str, data: bytes):
 KEPT = {"sample_id", "run", "town", "trajectory", "variant", "frame_index", "image", "instance", "depth", "split",
     "walk", "pair",
         "width_px", "height_px", "track", "time_s", "fov_deg", "pose", "has_caption"}  # fmt: skip
-FEW_PIXELS = zlib.compress(b"\0" * 1000)
-MASK = instance_bytes(np.zeros((90, 160), np.uint8), np.zeros((90, 160), np.uint16))
 ODD_ROWS = {
-    "a PNG of 60,000 x 60,000": picture("image", png_around(FEW_PIXELS, 60_000, 60_000)),
-    "an instance of 60,000 x 60,000": picture("instance", png_around(FEW_PIXELS, 60_000, 60_000)),
-    "a PNG that unpacks to less": picture("image", png_around(FEW_PIXELS, 160, 90)),
-    "an array of 4 TB": picture("depth", large_array()), "no bytes": picture("image", b""),
-    "no depth": picture("depth", b""), "text for a picture": picture("instance", b"hello" * 100),
-    "an instance cut short": picture("instance", MASK[:-30]), "depth in double": picture("depth", double_depth()),
+    "a PNG of 60,000 x 60,000": picture("image", png_around(zlib.compress(b"\0" * 1000), 60_000, 60_000)),
+    "no bytes": picture("image", b""), "no depth": picture("depth", b""),
+    "text for a picture": picture("instance", b"hello" * 100),
     "a flat depth": change(at(everything, 1), lambda r: set_depth(r, np.full((90, 160), 7.0, np.float32))),
     "no pose": put(at(everything, 2), pose=None),
     "hardly anything": change(at(everything, 2), lambda r: r.update(dict.fromkeys(r.keys() - KEPT))),
@@ -240,7 +219,7 @@ ODD_ROWS = {
 
 
 @pytest.mark.slow
-@each("name", ODD_ROWS)
+@pytest.mark.parametrize("name", ODD_ROWS)
 def test_odd_rows_are_findings_and_no_traceback(honest, tmp_path, name):
     try:
         forged = forge(honest, tmp_path / "forged", ODD_ROWS[name])

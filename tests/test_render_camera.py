@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tables import each
-from test_cosfly_render import needs_gl
 from test_renderers_contract import WALKER, circling, opened, pose_towards, street, write_inputs
 
 from cosfly.formats.boxes import MapHeader, make_box_map
@@ -102,7 +100,6 @@ def zoomed_tree(tmp_path_factory) -> tuple[Path, list[Path]]:
     return run(cfg, *inputs, folder / "render", seed=2), inputs
 
 
-@needs_gl
 def test_every_frame_tells_the_camera_it_was_drawn_with(zoomed_tree):
     tree, _ = zoomed_tree
     flights = [read_track(folder) for folder in find_tracks(tree)]
@@ -219,7 +216,7 @@ POSE = pose_towards((-14.0, -16.0, 8.0), (12.0, 2.0, 2.0))
 
 @pytest.fixture(scope="module")
 def renderer():
-    renderer = opened("gl", town())  # skips where it cannot run
+    renderer = opened("gl", town())
     yield renderer
     renderer.close()
 
@@ -251,8 +248,6 @@ def test_labels_never_change_and_every_pair_of_presets_is_another_picture(render
 @pytest.fixture(scope="module")
 def trees(tmp_path_factory):
     """Three flights of both tracks: without weather, and drawn by seed; and the folder of their inputs."""
-    if needs_gl.args[0]:
-        pytest.skip(needs_gl.kwargs["reason"])
     folder = tmp_path_factory.mktemp("weather")
     inputs = write_inputs(folder / "in", [circling(3, f"path_{k:03d}") for k in range(3)])
     return [
@@ -319,7 +314,7 @@ def test_a_configuration_in_which_the_target_is_small_is_remarked_on():
     assert small_targets(RunConfig.model_validate(mostly)) == []
 
 
-@each(
+@pytest.mark.parametrize(
     ("change", "is_legible"),
     [({}, True), ({"visible": False}, False), ({"visibility": 0.2}, False), ({"contrast": 3.0}, False),
         ({"contrast": None}, False), ({"bbox_2d": [0.0, 0.0, 6.0, 15.0]}, False), ({"bbox_2d": None}, False)],
@@ -332,7 +327,6 @@ def test_legible_is_what_the_bounds_say(change, is_legible):
     assert told["height_px"] == (0.0 if target.bbox_2d is None else target.bbox_2d[3])
 
 
-@needs_gl
 def test_legibility_is_of_the_picture_as_written(tmp_path):
     boxes, simplified, traces = write_inputs(tmp_path, [circling(3)])
     size = {"width_px": 320, "height_px": 180, "fovs_deg": [60], "tracks": ["clean"]}

@@ -15,7 +15,8 @@ from simulators import unrealcv_server
 from simulators.scene import clothes_of
 from simulators.unrealcv_server import UnrealCvServer
 from test_renderers_contract import street
-from test_simulators_carla import FRAMES, files_of, flown, same_but_for_pictures, schema_of
+from test_simulators_carla import CLEAN, FRAMES, files_of, flown, same_but_for_pictures, schema_of
+from test_simulators_carla import config as carla_config
 
 from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.formats.kinds import KINDS
@@ -144,7 +145,6 @@ def test_where_sizes_come_from_and_what_is_left_out(tmp_path):
         level_map(objects[-1:], UnrealCvMapConfig(), "here", "1.1.0", "City")
 
 
-CLEAN = {**FRAMES, "tracks": ["clean"]}
 QUICK = {"timeout_s": 60.0, "settle_delay_s": 0.02}
 
 
@@ -245,32 +245,44 @@ def test_a_camera_that_falls_is_found(monkeypatch):
         renderer.close()
 
 
+# protocol -> the inputs of a run, and its settings
+SIMULATORS = {"carla": (flown, carla_config), "unrealcv": (inputs, config)}
+
+
 @pytest.mark.slow
-def test_lost_late_double_and_broken_pictures_are_asked_again(tmp_path):
-    given = inputs(tmp_path / "in", 1, 5)
-    trees = []
-    faults = ("drop:depth@2", "duplicate:lit@4", "malformed:object_mask@6", "malformed:depth@8", "delay:lit@10=4")
+@pytest.mark.parametrize(("protocol", "faults", "own"), [
+    ("carla", ("drop:depth@5", "duplicate@7", "reorder:rgb@9", "delay:instance@11=7"), {"timeout_s": 6.0}),
+    ("unrealcv", ("drop:depth@2", "duplicate:lit@4", "malformed:object_mask@6", "malformed:depth@8", "delay:lit@10=4"),
+        {"timeout_s": 3.0, "animate": False}),
+])  # fmt: skip
+def test_lost_late_double_broken_and_disordered_pictures_change_nothing(protocol, faults, own, tmp_path):
+    fly, settings = SIMULATORS[protocol]
+    given, trees = fly(tmp_path / "in", 1, 5), []
     for name, planted in {"plain": (), "faulty": faults}.items():
-        with serving(street(), tmp_path / name, *planted, protocol="unrealcv") as port:
-            cfg = config(port, timeout_s=3.0, animate=False)
-            trees.append(run(cfg, *given, tmp_path / f"tree_{name}", workers=1))
+        with serving(street(), tmp_path / name, *planted, protocol=protocol) as port:
+            trees.append(run(settings(port, **own), *given, tmp_path / f"tree_{name}", workers=1))
     assert files_of(trees[0]) == files_of(trees[1])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("fault", "told"), [("die@6", "refused"), ("hang@6", "no answer in 8 s")])
-def test_a_server_that_ends_is_named_and_the_run_goes_on_with_the_next(fault, told, tmp_path):
-    given = inputs(tmp_path / "in", 2, 4)
+@pytest.mark.parametrize(("protocol", "fault", "timeout_s", "told"), [
+    ("carla", "die@10", 5.0, ""),
+    ("unrealcv", "die@8", 8.0, r" \(UnrealCV.*refused"),
+    ("unrealcv", "hang@8", 8.0, r" \(UnrealCV.*no answer in 8 s"),
+])  # fmt: skip
+def test_a_server_that_ends_is_named_and_the_run_goes_on_with_the_next(protocol, fault, timeout_s, told, tmp_path):
+    fly, settings = SIMULATORS[protocol]
+    given, tree = fly(tmp_path / "in", 2, 5), tmp_path / "tree"
     with (
-        serving(street(), tmp_path / "town", fault, protocol="unrealcv") as port,
-        pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port} \(UnrealCV.*{told}"),
+        serving(street(), tmp_path / "town", fault, protocol=protocol) as port,
+        pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port}{told}"),
     ):
-        run(config(port, timeout_s=8.0), *given, tmp_path / "tree", workers=1)
-    assert len(find_tracks(tmp_path / "tree")) == 1
-    kept = files_of(tmp_path / "tree")
-    with serving(street(), tmp_path / "town", protocol="unrealcv") as port:
-        files = files_of(run(config(port), *given, tmp_path / "tree", workers=1))
-    assert len(find_tracks(tmp_path / "tree")) == 2
+        run(settings(port, timeout_s=timeout_s), *given, tree, workers=1)
+    assert len(find_tracks(tree)) == 1
+    kept = files_of(tree)
+    with serving(street(), tmp_path / "town", protocol=protocol) as port:
+        files = files_of(run(settings(port), *given, tree, workers=1))
+    assert len(find_tracks(tree)) == 2
     assert {name: files[name] for name in kept} == kept
 
 

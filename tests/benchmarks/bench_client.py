@@ -21,7 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from specimens_captions import VOCABULARY
-from teacher_server import CHINESE, ENGLISH
+from teacher_server import CHINESE, ENGLISH, kept_answers
 
 from caption.schema import CaptionConfig
 from caption.stage.asking import Asking
@@ -29,7 +29,6 @@ from caption.stage.stage import open_stage
 from caption.stage.tracks import find_inputs
 from caption.teachers import teacher
 from cosfly.formats.frames import SKY_DEPTH_M
-from cosfly.llm import protocol
 from cosfly.viz.frame_views import VIEW_FILES
 from specimens import make_playback_tree
 
@@ -73,27 +72,22 @@ def _client(cfg: CaptionConfig, tree: Path, out: Path, encoded: dict[tuple, list
     """
     stage = open_stage(cfg, tree, out, 0, "never")
     tracks, _ = find_inputs(cfg, tree)
-    sent: list[None] = []
-    plain_encode, plain_body = teacher.encode_frame, protocol.request_body
+    plain_encode = teacher.encode_frame
 
     def encoding(*args: Any) -> list:
         if args[:2] not in encoded:
             encoded[args[:2]] = plain_encode(*args)
         return encoded[args[:2]]
 
-    def counting(*args: Any, **options: bool) -> bytes:
-        sent.append(None)
-        return plain_body(*args, **options)
-
-    teacher.encode_frame, protocol.request_body = encoding, counting
+    teacher.encode_frame = encoding
     try:
         start_s = time.monotonic()
         asked = asyncio.run(Asking(stage, cfg, VOCABULARY, 0).run(tracks))
         seconds = time.monotonic() - start_s
     finally:
-        teacher.encode_frame, protocol.request_body = plain_encode, plain_body
+        teacher.encode_frame = plain_encode
     assert not asked.unanswered, asked.unanswered[:3]
-    return len(sent) / seconds
+    return len(kept_answers(out)) / seconds
 
 
 def _make_tree(root: Path, num_windows: int) -> Path:

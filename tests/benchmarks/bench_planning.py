@@ -4,6 +4,7 @@ python tests/benchmarks/bench_planning.py [--maps a b] [--planners muco ...]
 """
 
 import argparse
+import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,10 @@ from typing import Any
 
 import numpy as np
 import scenes
-from scipy.optimize import minimize
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from specimens_planning import solved_by_scipy
 
 from cosfly.formats.boxes import BoxMap, write_boxes
 from cosfly.geometry.kernels import BoxIndex, obstacle_index
@@ -19,7 +23,6 @@ from cosfly.pedestrians.stage import PedestriansConfig, make_pedestrian, run, wa
 from cosfly.pedestrians.walkable import WalkableGround
 from cosfly.planners.contract import PLANNERS, PlanConfig, Scenario, load_planner
 from cosfly.planners.muco import muco
-from cosfly.planners.muco.loss import evaluate, make_state
 from cosfly.planners.stage import make_scenario
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.seeding import rng_for
@@ -124,20 +127,9 @@ def compare_with_scipy(scene: Scene, cfg: PlanConfig) -> list:
         ms, (_, solver, _) = scenes.cpu_ms(
             lambda f=first, p=problem: muco.optimize(f, p, scene.obstacles, without_rule)
         )
-        state, unmasked = make_state(len(first), len(scene.obstacles.rows)), np.zeros(len(first), dtype=bool)
-
-        def loss_and_gradient(interior, first=first, problem=problem, state=state, unmasked=unmasked):
-            points = np.vstack([first[:1], interior.reshape(-1, 3), first[-1:]])
-            value = evaluate(points, problem, scene.obstacles, unmasked, state)
-            return value, (state.gradient + state.visibility_gradient)[1:-1].reshape(-1)
-
-        heights = [(low, high) for low, _, high in problem.altitudes[1:-1]]
-        asked = {
-            "jac": True, "method": "L-BFGS-B", "options": {"maxiter": 3000, "maxfun": 6000},
-            "bounds": [pair for height in heights for pair in ((None, None), (None, None), height)],
-        }  # fmt: skip
-        start = first[1:-1].reshape(-1)
-        peer_ms, peer = scenes.cpu_ms(lambda f=loss_and_gradient, x=start, a=asked: minimize(f, x, **a))
+        peer_ms, peer = scenes.cpu_ms(
+            lambda f=first, p=problem: solved_by_scipy(f, p, scene.obstacles, maxiter=3000, maxfun=6000)
+        )
         rows.append((ms, peer_ms, solver["loss_end"] / peer.fun))
     table = np.array(rows)
     return [

@@ -42,10 +42,6 @@ SHAPES: dict[str, dict[str, Any]] = {
         "hidden_size": 576, "num_hidden_layers": 30, "num_attention_heads": 9, "num_key_value_heads": 3, "head_dim": 64,
         "intermediate_size": 1536, "vocab_size": 49_152, "max_position_embeddings": 8192,
     },
-    "tiny_text": {
-        "hidden_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16,
-        "intermediate_size": 128, "vocab_size": 5000,
-    },
     "tiny": {
         "hidden_size": 64, "num_hidden_layers": 4, "num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16,
         "linear_num_key_heads": 2, "linear_num_value_heads": 4, "linear_key_head_dim": 16,
@@ -54,7 +50,7 @@ SHAPES: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 TOWERS = {"2b": (1024, 24, 4096), "tiny": (32, 2, 64)}  # width, layers, MLP
 SIZES_PX = {"2b": (640, 352), "tiny": (64, 64)}
-WORDS = {"2b": (660, 250), "tiny": (80, 40), "smollm2": (1120, 250), "tiny_text": (80, 40)}  # of prompt and answer
+WORDS = {"2b": (660, 250), "tiny": (80, 40), "smollm2": (1120, 250)}  # of prompt and answer
 PICTURES = 5
 IMAGE, END, PAD, FIRST_WORD = 3, 1, 0, 10  # token numbers of the made-up vocabulary
 WARM_UP = 3
