@@ -13,9 +13,11 @@ from pydantic import ValidationError
 from tables import each
 from teacher_server import TeacherServer
 
+from cosfly.maps.boxlist import BoxList
 from cosfly.maps.footprints import footprints, rectangle_polygon
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map
+from cosfly.maps.town_parts import Plot
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import read_json, read_model
 from cosfly.runtime.run_dir import read_manifest
@@ -245,3 +247,10 @@ def test_worlds_go_on_to_releases_with_the_settings_that_are_told(tmp_path, in_t
         assert (run_folder / "release/dataset/README.md").is_file()
         assert (run_folder / "viewer.html").is_file()
         assert f"seed: {5 + number}\n" in (run_folder / "run.yaml").read_text()
+
+
+def test_a_low_tree_in_parts_has_no_part_without_a_volume():
+    plot = Plot(BoxList(), (0, 0), (9, 9), np.random.default_rng(0))
+    for _ in range(200):
+        plot.tree((0, 0), (3.0, 4.0), (4.0, 4.5), parts=1)
+    assert 2 * 200 < len(plot) < 6 * 200
