@@ -249,6 +249,15 @@ def test_worlds_go_on_to_releases_with_the_settings_that_are_told(tmp_path, in_t
         assert f"seed: {5 + number}\n" in (run_folder / "run.yaml").read_text()
 
 
+@each("width", ["boulevards of 40 m", "pavements of 3 m", "streets of at most 12 m", "lanes between 4 and 6 m"])
+def test_the_width_of_a_street_sets_no_height(width):
+    plain, named = (plan_by_rules(f"a town with {words} and houses", 0) for words in ("streets", width))
+    assert named[0].heights_m == plain[0].heights_m
+    assert named[0].buildings == plain[0].buildings
+    assert named[0].highest_m is None
+    assert width in named[1]["not_used"]
+
+
 def test_a_low_tree_in_parts_has_no_part_without_a_volume():
     plot = Plot(BoxList(), (0, 0), (9, 9), np.random.default_rng(0))
     for _ in range(200):
