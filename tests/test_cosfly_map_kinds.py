@@ -173,7 +173,6 @@ def test_a_real_sequence_of_buildings_is_read(shared_data: Path):
     )
     assert box_map.header.num_objects == 199
     assert box_map.header.dropped_objects == {"outline_of_parts": 99}
-    assert box_map.header.building_covered_share > 0.995
     assert set(box_map.kinds) == {KINDS["Buildings"]}
     assert coarse.maxs[:, 2].max() == pytest.approx(26.396 + 0.075, abs=1e-3)  # at level 1.2
     assert box_map.maxs[:, 2].max() == pytest.approx(76.224 + 0.075, abs=1e-3)  # as drawn, at level 2.2
@@ -327,7 +326,6 @@ def test_a_city_model_becomes_boxes_round_the_origin(tmp_path: Path):
     assert boxes.header.offset_m == {"x": 110.0, "y": 65.0, "z": 2.0}
     house = boxes_of(boxes, "Buildings")
     np.testing.assert_allclose(np.r_[house.mins[0], house.maxs[0]], (-10, -15, 0, 0, -9, 12), atol=1e-6)
-    assert boxes.header.building_area_ratio == pytest.approx(1.0, abs=1e-3)
     roads = boxes_of(boxes, "Roads")
     assert roads.maxs[:, 2].max() <= 0
     assert roads.half_extents.max() <= 30

@@ -135,13 +135,17 @@ HOSTILE = {
     "empty.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 0}]), "no triangles"),
     "sparse.glb": (
         one_triangle(FLAT, accessors=[{"componentType": 5126, "type": "VEC3", "count": 3}]),
-        "sparse accessor",
+        "not supported; got an accessor without a bufferView",
+    ),
+    "changed.glb": (
+        one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 3, "sparse": {"count": 1}}]),
+        "not supported; got a sparse accessor",
     ),
     "strip.glb": (
         one_triangle(FLAT, meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 5}]}]),
-        "not a list of triangles",
+        "not supported; got strips or fans of triangles",
     ),
-    "negative.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": -3}]), "not a list of triangles"),
+    "negative.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": -3}]), "negative count"),
     "loop.glb": (one_triangle(FLAT, nodes=[{"mesh": 0, "children": [0]}], scenes=[{"nodes": [0]}]), "two parents"),
     "packed.glb": (one_triangle(FLAT, extensionsRequired=["EXT_meshopt_compression"]), "a glTF extension"),
     "out.glb": (one_triangle(FLAT, buffers=[{"byteLength": 36, "uri": "../secret.bin"}]), "data in another file"),

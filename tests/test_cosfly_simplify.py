@@ -157,7 +157,6 @@ def test_the_simworld_variants_work_together():
     assert [name for name, _ in result.passes] == ["input", "merge", "crop_tree", "crop_below_ground", "prune_nested"]
     solid = result.box_map.select(result.box_map.kinds != ROADS)
     assert solid.mins[:, 2].min() >= -1e-9
-    assert "trunks" not in result.box_map.header.model_dump()
 
 
 def test_below_ground_goes_by_the_top_face_and_spares_surfaces():
@@ -248,9 +247,6 @@ def test_stage_writes_map_report_and_picture(tmp_path: Path):
     assert report["num_boxes"] == {"raw": 120, "simplified": len(simplified)}
     assert report["passes"][-1]["counts"] == simplified.counts()
     assert 0 < report["grid"]["iou"] <= 1
-    trunks = report["trunks"]
-    assert trunks["stem"]["simplified_walkable_m2"] == report["grid"]["simplified_walkable_m2"]
-    assert trunks["stem"]["simplified_walkable_m2"] > trunks["full"]["simplified_walkable_m2"]
     assert (tmp_path / "out/simplify.png").read_bytes()[:4] == b"\x89PNG"
 
     written = product.read_bytes()

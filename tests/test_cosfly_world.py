@@ -12,9 +12,11 @@ from commands import invoke
 from pydantic import ValidationError
 from teacher_server import TeacherServer
 
+from cosfly.maps.boxlist import BoxList
 from cosfly.maps.footprints import footprints, rectangle_polygon
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map
+from cosfly.maps.town_parts import Plot
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import read_json, read_model
 from cosfly.runtime.run_dir import read_manifest
@@ -244,3 +246,19 @@ def test_worlds_go_on_to_releases_with_the_settings_that_are_told(tmp_path, in_t
         assert (run_folder / "release/dataset/README.md").is_file()
         assert (run_folder / "viewer.html").is_file()
         assert f"seed: {5 + number}\n" in (run_folder / "run.yaml").read_text()
+
+
+@each("width", ["boulevards of 40 m", "pavements of 3 m", "streets of at most 12 m", "lanes between 4 and 6 m"])
+def test_the_width_of_a_street_sets_no_height(width):
+    plain, named = (plan_by_rules(f"a town with {words} and houses", 0) for words in ("streets", width))
+    assert named[0].heights_m == plain[0].heights_m
+    assert named[0].buildings == plain[0].buildings
+    assert named[0].highest_m is None
+    assert width in named[1]["not_used"]
+
+
+def test_a_low_tree_in_parts_has_no_part_without_a_volume():
+    plot = Plot(BoxList(), (0, 0), (9, 9), np.random.default_rng(0))
+    for _ in range(200):
+        plot.tree((0, 0), (3.0, 4.0), (4.0, 4.5), parts=1)
+    assert 2 * 200 < len(plot) < 6 * 200

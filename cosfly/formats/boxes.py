@@ -82,9 +82,6 @@ class MapHeader(_Kept):
     added_boxes: int = 0  # number of boxes that the source does not hold
     derived_ground: int = 0  # number of these that are ground, derived from the buildings
     offset_m: dict[str, float] = {}  # added to coordinates of this map, gives those of the source
-    building_footprint_m2: float | None = None
-    building_area_ratio: float | None = None
-    building_covered_share: float | None = None
     num_objects: int | None = None  # of the source, including dropped ones
     dropped_objects: dict[str, int] = {}
     passes: list[SimplifyPass] = []

@@ -11,7 +11,7 @@ import re
 import struct
 from collections import Counter
 from functools import cache
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -164,16 +164,18 @@ class _Gltf:
 
     def num_triangles(self, primitive: dict) -> int:
         """Return the number of triangles that a primitive declares."""
-        count = self.accessors[primitive.get("indices", primitive["attributes"]["POSITION"])]["count"]
-        if count < 0 or primitive.get("mode", TRIANGLES) != TRIANGLES:
-            raise ValueError("a primitive is not a list of triangles")
+        count = self.accessors_of(primitive)[0]["count"]
+        if count < 0:
+            raise ValueError("an accessor has a negative count")
         return count // 3
 
-    def numbers(self, accessor_number: int, num_columns: int) -> np.ndarray:
+    def accessors_of(self, primitive: dict) -> list[dict]:
+        """Return the accessors of a primitive's indices, if it has them, and of its positions."""
+        numbers = (primitive["indices"],) if "indices" in primitive else ()
+        return [self.accessors[number] for number in (*numbers, primitive["attributes"]["POSITION"])]
+
+    def numbers(self, accessor: dict, num_columns: int) -> np.ndarray:
         """Return the values of an accessor, (n, num_columns), as a view on the binary chunk."""
-        accessor = self.accessors[accessor_number]
-        if "bufferView" not in accessor or "sparse" in accessor:
-            raise ValueError("a sparse accessor is not supported")
         if accessor["type"] != {1: "SCALAR", 3: "VEC3"}[num_columns]:
             raise ValueError(f"an accessor of type {accessor['type']} is used for {num_columns} columns")
         view, dtype = self.views[accessor["bufferView"]], np.dtype(DTYPES[accessor["componentType"]])
@@ -183,20 +185,27 @@ class _Gltf:
 
     def triangles(self, primitive: dict) -> np.ndarray:
         """Return the triangles of a primitive, (k, 3, 3) float64."""
-        corners = self.numbers(primitive["attributes"]["POSITION"], 3)
-        if "indices" in primitive:
-            corners = corners[self.numbers(primitive["indices"], 1)[:, 0]]
+        *indices, positions = self.accessors_of(primitive)
+        corners = self.numbers(positions, 3)
+        if indices:
+            corners = corners[self.numbers(indices[0], 1)[:, 0]]
         return corners[: len(corners) // 3 * 3].reshape(-1, 3, 3).astype(np.float64)
 
 
 def _check_features(gltf: _Gltf, path: Path) -> None:
-    """Raise InputError if geometry is packed or in another file; log a warning if there are materials."""
+    """Raise InputError if geometry is in a form or place that is not read; log a warning if there are materials."""
     required = gltf.document.get("extensionsRequired") or []
     found = [f"a glTF extension: {name}" for name in required if not APPEARANCE.match(name)]
     found += ["data in another file" for buffer in gltf.document.get("buffers") or [] if "uri" in buffer]
+    for primitive in chain(*gltf.primitives):
+        found += ["strips or fans of triangles"] * (primitive.get("mode", TRIANGLES) != TRIANGLES)
+        for accessor in gltf.accessors_of(primitive) if not found else ():
+            found += ["a sparse accessor"] * ("sparse" in accessor)
+            found += ["an accessor without a bufferView"] * ("bufferView" not in accessor)
     if found:
-        what, expected = "the mesh file uses a feature of glTF that is not supported", "glTF 2.0 in one file"
-        fix = "export the mesh again as .glb without compression and other extensions"
+        what = "the mesh file uses a feature of glTF that is not supported"
+        expected = "glTF 2.0 in one file, with lists of triangles"
+        fix = "export the mesh again as .glb: triangles, without compression, sparse accessors and other extensions"
         raise InputError(what, where=path, got=found[0][:99], expected=expected, fix=fix)
     if gltf.document.get("materials"):
         _warn_of_materials(path)

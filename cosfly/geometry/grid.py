@@ -31,7 +31,6 @@ WATER = KINDS["Water"]
 _LAYER_OF = np.zeros(256, dtype=np.int64)
 _LAYER_OF[[KINDS[name] for name in LAYERS]] = list(LAYERS.values())
 _CORNER_SIGNS = np.array([[x, y, z] for z in (-1.0, 1.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
-_EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
 
 
 @dataclass(frozen=True)
@@ -88,10 +87,10 @@ def blocks_walking(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M) -> np.n
 
 
 def occupancy(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M, like: OccupancyGrid | None = None) -> OccupancyGrid:
-    """Return the grid whose cells under boxes are occupied.
+    """Return the grid whose cells under the boxes of `blocks_walking` are occupied.
 
-    A cell is occupied if the part of a box between the ground and `height_m` overlaps it by more than TOUCH_M. Boxes
-    are rasterised exactly with their rotation, not as their axis-aligned bounds.
+    A cell is occupied if a box, seen from above, overlaps it by more than TOUCH_M. Boxes are rasterised exactly with
+    their rotation, not as their axis-aligned bounds.
 
     Args:
         like: Use this grid's cells, not those of `empty_grid`, so that two maps can be compared; boxes outside are
@@ -100,10 +99,7 @@ def occupancy(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M, like: Occupa
     """
     grid = empty_grid(box_map) if like is None else replace(like, occupied=np.zeros_like(like.occupied))
     boxes = box_map.select(blocks_walking(box_map, height_m=height_m))
-    is_water = boxes.kinds == WATER
-    lows = np.where(is_water, -np.inf, box_map.ground_z_m)
-    highs = np.where(is_water, np.inf, box_map.ground_z_m + height_m)
-    _mark(boxes, grid, grid.occupied, np.ones(len(boxes), bool), lows=lows, highs=highs)
+    _mark(boxes, grid, grid.occupied, np.ones(len(boxes), bool))
     return grid
 
 
@@ -146,60 +142,31 @@ def surface_kinds(box_map: BoxMap, kinds: Collection[int], *, like: OccupancyGri
 
 
 def _mark(
-    boxes: BoxMap, grid: OccupancyGrid, cells: np.ndarray, marks: np.ndarray,
-    *, lows: np.ndarray | float = -np.inf, highs: np.ndarray | float = np.inf, touch: float | None = None,
-) -> None:  # fmt: skip
+    boxes: BoxMap, grid: OccupancyGrid, cells: np.ndarray, marks: np.ndarray, *, touch: float | None = None
+) -> None:
     """Set the cells, (ny, nx), under boxes to the marks, (n,), of the boxes.
 
-    Args:
-        lows, highs: (n,) m, the slice of a box that counts. touch: cells, how deep a slice must reach into a cell;
-            TOUCH_M where None.
+    touch: cells, how deep a box must reach into a cell; TOUCH_M where None.
     """
     turns = rotation_matrices(np.radians(boxes.rotations_deg))
     extents = np.maximum(boxes.half_extents, MIN_HALF_EXTENT_M)
-    corners = np.einsum("nij,nkj->nki", turns, _CORNER_SIGNS * extents[:, None]) + boxes.centers[:, None]
-    corners[..., :2] = (corners[..., :2] - [grid.x_min_m, grid.y_min_m]) / grid.resolution_m
-    is_upright = np.abs(turns[:, 2, 2]) > 1.0 - 1e-12
-    ends_m = (np.full(len(boxes), end_m, dtype=np.float64) for end_m in (lows, highs))
+    corners = np.einsum("nij,nkj->nki", turns[:, :2], _CORNER_SIGNS * extents[:, None]) + boxes.centers[:, None, :2]
+    corners = (corners - [grid.x_min_m, grid.y_min_m]) / grid.resolution_m
+    # The four corners of the top of an upright box lie over those of its bottom.
+    counts = np.where(np.abs(turns[:, 2, 2]) > 1.0 - 1e-12, 4, 8)
     touch = TOUCH_M / grid.resolution_m if touch is None else touch
     # As bytes, so that masks and kinds share one compiled function.
-    _rasterise(corners, *ends_m, is_upright, touch, marks.view(np.uint8), cells.view(np.uint8))
+    mark_hulls(corners, counts, touch, marks.view(np.uint8), cells.view(np.uint8))
 
 
 @njit(cache=True)
-def _rasterise(corners, lows, highs, is_upright, touch, marks, cells):  # pragma: no cover (compiled)
-    """Mark the cells under the slices of boxes, in their order; corners (n, 8, 3) with x and y in cells, z in m."""
-    points = np.empty((8 + 2 * len(_EDGES), 2))
-    for box in range(len(corners)):
-        if is_upright[box]:
-            count = 4
-            for k in range(4):
-                points[k, 0], points[k, 1] = corners[box, k, 0], corners[box, k, 1]
-        else:
-            count = _slice_points(corners, box, lows[box], highs[box], points)
-        if count > 0:
-            _fill_hull(points, count, touch, marks[box], cells)
+def mark_hulls(corners, counts, touch, marks, cells):  # pragma: no cover (compiled)
+    """Mark the cells, (ny, nx), under the hulls of the first `counts`, (n,), of points, (n, k, 2) in cells, in order.
 
-
-@njit(cache=True)
-def _slice_points(corners, box, low, high, points):  # pragma: no cover (compiled)
-    """Collect points whose hull is the footprint of a box between two heights: corners inside and cut edges."""
-    count = 0
-    for k in range(8):
-        if low <= corners[box, k, 2] <= high:
-            points[count, 0], points[count, 1] = corners[box, k, 0], corners[box, k, 1]
-            count += 1
-    for edge in range(len(_EDGES)):
-        a, b = _EDGES[edge, 0], _EDGES[edge, 1]
-        za, zb = corners[box, a, 2], corners[box, b, 2]
-        for end in range(2):
-            height = low if end == 0 else high
-            if (za < height) != (zb < height):  # never at an infinite height
-                t = (height - za) / (zb - za)
-                for axis in range(2):
-                    points[count, axis] = corners[box, a, axis] + t * (corners[box, b, axis] - corners[box, a, axis])
-                count += 1
-    return count
+    touch: cells, how deep a hull must reach into a cell: 0.5 or a little less for hulls that hold its centre.
+    """
+    for hull in range(len(corners)):
+        _fill_hull(corners[hull], counts[hull], touch, marks[hull], cells)
 
 
 @njit(cache=True)

@@ -11,7 +11,6 @@ import hashlib
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -25,7 +24,6 @@ NEAR_SHARE = 0.5  # least share of common seconds in which two tracks are near; 
 FEW_S = 5  # least number of near seconds, unless all are near: two who begin at one place are near for some seconds
 MOST_GAP_S = 2.0  # longest gap between points that a position is interpolated over
 ON_TIME_S = 1e-3  # a point this close to a full second counts as at that second
-SAME_M = 1e-3  # tracks that differ by less are compared with the others only once
 
 
 @dataclass(frozen=True)
@@ -57,13 +55,6 @@ class Course:
             target_m[:, axis] = np.interp(seconds, time_s, places_m[:, axis])
         return Course(self.name, self.town, seconds, target_m)
 
-    @cached_property
-    def key(self) -> tuple[str, bytes]:
-        """Return a key that two courses of one walk and length share, apart from noise; for courses `at_seconds`."""
-        digest = hashlib.sha256(self.time_s.tobytes())
-        digest.update(np.round(self.target_m[:, :2] / SAME_M).tobytes())
-        return town_family(self.town), digest.digest()
-
 
 def town_family(town: str) -> str:
     """Return the name that a town has in all of its builds: `Town03` and `Town03_Opt` are one map."""
@@ -83,24 +74,17 @@ def walks_of(courses: Iterable[Course]) -> dict[str, str]:
     walk is a connected component. Its name is the alphabetically first of its courses' names, so it depends neither on
     the order nor on the number of the courses.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+    from scipy.cluster.hierarchy import DisjointSet
 
-    sampled = sorted((course.at_seconds() for course in courses), key=lambda course: (course.name, course.key))
-    first_of_key: dict[tuple[str, bytes], Course] = {}
-    pairs = [
-        (course.name, first_of_key.setdefault(course.key, course).name) for course in sampled if len(course.time_s)
-    ]
+    sampled = [course.at_seconds() for course in courses]
+    walks = DisjointSet(course.name for course in sampled)
     families = defaultdict(list)
-    for course in first_of_key.values():
+    for course in sampled:
         families[town_family(course.town)].append(course)
-    pairs += [pair for family in families.values() for pair in _near_pairs(family)]
-    index_of = {name: k for k, name in enumerate(dict.fromkeys(course.name for course in sampled))}  # by alphabet
-    edges = np.array([(index_of[left], index_of[right]) for left, right in pairs], dtype=np.int32).reshape(-1, 2).T
-    graph = coo_array((np.ones(edges.shape[1], dtype=bool), tuple(edges)), shape=(len(index_of), len(index_of)))
-    components = connected_components(graph, directed=False)[1].tolist() if index_of else []
-    first_name: dict[int, str] = {}
-    return {name: first_name.setdefault(component, name) for name, component in zip(index_of, components, strict=True)}
+    for family in families.values():
+        for left, right in _near_pairs(family):
+            walks.merge(left, right)
+    return {name: min(walk) for walk in walks.subsets() for name in walk}
 
 
 def _near_pairs(courses: list[Course]) -> list[tuple[str, str]]:

@@ -19,7 +19,7 @@ from shapely.geometry import Polygon
 
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.formats.meshes import MESHES_FILE, Meshes, MeshRef
-from cosfly.maps.boxlist import BoxList, MapLicence, MapName, origin_m, required
+from cosfly.maps.boxlist import WIDEST_M, BoxList, MapLicence, MapName, origin_m, required
 from cosfly.maps.cityjson_file import CityObject, Surface, read_model
 from cosfly.maps.footprints import (
     CUT_SHARES,
@@ -29,7 +29,6 @@ from cosfly.maps.footprints import (
     cover,
     num_cuts,
     polygons_of,
-    rectangle_polygon,
     united,
     with_derived_ground,
 )
@@ -66,14 +65,11 @@ Facet = tuple[Polygon, np.ndarray]
 
 @dataclass
 class CityBoxes:
-    """The boxes of a city model, and the facts about them that its map needs."""
+    """The boxes of a city model, and the meshes that are drawn instead of some."""
 
     boxes: BoxList = field(default_factory=BoxList)
     mesh_refs: dict[int, MeshRef] = field(default_factory=dict)  # by id of a box
     meshes: dict[str, np.ndarray] = field(default_factory=dict)  # by id of an object
-    footprint_m2: float = 0.0  # of the buildings
-    boxes_m2: float = 0.0  # of their boxes
-    covered_m2: float = 0.0  # of the part of the buildings' footprints under their boxes
 
 
 def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
@@ -82,13 +78,10 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     model = read_model(path, cfg.units, cfg.most_skipped)
     objects, origin = _centred(model.objects, path)
     city = _boxes_of(_flattened(objects), cfg, model.dropped.counts)
-    footprint_m2 = city.footprint_m2
     header = MapHeader(
         name=cfg.name, source=MapSource(tool=cfg.tool, version=f"CityJSON {model.version}", file=path.name),
         licence=cfg.licence, credits=cfg.credits, ground_z_m=0.0,
-        offset_m=dict(zip("xyz", origin.tolist(), strict=True)), building_footprint_m2=round(footprint_m2, 1),
-        building_area_ratio=round(city.boxes_m2 / footprint_m2, 4) if footprint_m2 else None,
-        building_covered_share=round(city.covered_m2 / footprint_m2, 4) if footprint_m2 else None,
+        offset_m=dict(zip("xyz", origin.tolist(), strict=True)),
         num_objects=model.num_objects, dropped_objects=dict(+model.dropped.counts),
     )  # fmt: skip
     box_map = replace(city.boxes.box_map(header), meshes=Meshes(city.mesh_refs, made=city.meshes))
@@ -196,23 +189,16 @@ def _add_solid(city: CityBoxes, cfg: CityJsonConfig, item: CityObject, footprint
     top_m = max(float(z.max()), float(z.min()) + 0.1)
     mesh = solid_mesh(item.detailed, bottom_m) if cfg.solids else None
     first_row = len(city.boxes)
-    outlines = []
     for rectangle in _pieces(
         city.boxes, footprint, 0.05, min_fill=SOLID_FILL, min_size_m=SOLID_PIECE_M, shares=CUT_SHARES
     ):
         high_m = max(top_m if mesh is None else _top_within(mesh, rectangle, top_m), bottom_m + 0.1)
         city.boxes.add(item.rule.kind, rectangle.center, rectangle.size, bottom_m, high_m, rectangle.yaw_deg)
-        outlines.append(rectangle_polygon(rectangle))
     rows = range(first_row, len(city.boxes))
     if mesh is not None and rows:
         city.meshes[item.object_id] = mesh
         ref = MeshRef(file=MESHES_FILE, node=item.object_id, fit="world")
         city.mesh_refs |= {row + 1: ref for row in rows}  # ids are rows counted from 1
-    if item.rule.kind == "Buildings":
-        outline = united(outlines)
-        city.footprint_m2 += footprint.area
-        city.boxes_m2 += outline.area
-        city.covered_m2 += shapely.intersection(footprint, outline).area
 
 
 def solid_mesh(surfaces: list[Surface], foot_m: float) -> np.ndarray | None:
@@ -382,6 +368,7 @@ TERRAIN_KINDS = ("Roads", "Sidewalks", "Ground", "Terrain", "RailTrack")
 FLAT_WITHIN_M = 3.0  # ground that rises less over the whole map keeps its heights
 REPORTED_RISE_M = 1.0  # a smaller rise is kerbs and steps
 RISE_SHARES = (2, 98)  # percentiles: a few stray vertices do not tilt a town
+FAR_M = 100 * WIDEST_M  # of corners beyond all samples, so that the ground of the border goes on
 SAME_PLACE_M = 0.1  # vertices nearer than this are one, at their mean height
 
 
@@ -409,32 +396,21 @@ def _flattened(objects: list[CityObject]) -> list[CityObject]:
 
     def lowered(item: CityObject) -> CityObject:
         if item.rule.form != "solid":
-            return item.moved(lambda ring: ring - np.outer(ground_m(ring), up))
-        lowest_m = ground_m(item.corners()).min()
+            return item.moved(lambda ring: ring - np.outer(ground_m(ring[:, :2]), up))
+        lowest_m = ground_m(item.corners()[:, :2]).min()
         return item.moved(lambda ring: ring - lowest_m * up)
 
     return [lowered(item) for item in objects]
 
 
 def _heights_between(samples: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the function from places, (n, 2 or 3), to heights, (n,): linear between samples, (k, 3), and that of the
-    nearest sample beyond them."""
+    """Return the function from places, (n, 2), to heights, (n,): linear between samples, (k, 3), and about that of the
+    border beyond them."""
     # Imported here: half a second that every command would spend for the settings of the maps.
-    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
-    from scipy.spatial import QhullError
+    from scipy.interpolate import LinearNDInterpolator
 
     places, group = np.unique(np.round(samples[:, :2] / SAME_PLACE_M), axis=0, return_inverse=True)
     heights = np.bincount(group.ravel(), samples[:, 2]) / np.bincount(group.ravel())
-    places *= SAME_PLACE_M
-    nearest = NearestNDInterpolator(places, heights)
-    try:
-        linear = LinearNDInterpolator(places, heights)
-    except QhullError:  # too few samples, or all on one line
-        log.warning("the %d ground samples span no area, so heights are those of the nearest sample", len(places))
-        linear = nearest
-
-    def heights_at(points: np.ndarray) -> np.ndarray:
-        between = linear(points[:, :2])
-        return np.where(np.isnan(between), nearest(points[:, :2]), between)
-
-    return heights_at
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * FAR_M  # so that every place lies between samples
+    heights = np.append(heights, np.full(len(corners), heights.mean()))
+    return LinearNDInterpolator(np.concatenate([places * SAME_PLACE_M, corners]), heights)

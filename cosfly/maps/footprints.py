@@ -158,29 +158,17 @@ def check_outline(polygon: Polygon, where: str) -> None:
 
 def num_crossings(polygon: Polygon) -> int:
     """Count the pairs of edges that meet and are not neighbours in a ring; stop soon after MOST_CROSSINGS."""
-    edges: list[np.ndarray] = []
-    neighbours: list[np.ndarray] = []  # the number of the edge before each
-    num_edges = 0
-    for ring in (polygon.exterior, *polygon.interiors):
-        corners = np.asarray(ring.coords)[:, :2]
-        corners = corners[np.r_[True, (np.diff(corners, axis=0) != 0).any(axis=1)]]
-        edges.append(np.stack([corners[:-1], corners[1:]], axis=1))
-        neighbours.append(num_edges + np.roll(np.arange(len(corners) - 1), 1))
-        num_edges += len(corners) - 1
-    if not num_edges:
-        return 0
-    lines = shapely.linestrings(np.concatenate(edges))
-    previous = np.concatenate(neighbours)
-    tree = shapely.STRtree(lines)
-    count = 0
-    step = max(1, PAIRS_AT_ONCE // len(lines))
-    for start in range(0, len(lines), step):
-        first, second = tree.query(lines[start : start + step], predicate="intersects")
-        first = first + start
-        count += int(((first < second) & (previous[first] != second) & (previous[second] != first)).sum())
-        if count > MOST_CROSSINGS:
+    rings = [shapely.get_coordinates(ring) for ring in (polygon.exterior, *polygon.interiors)]
+    ends = np.concatenate([np.stack([ring[:-1], ring[1:]], axis=1) for ring in rings])
+    edges = shapely.linestrings(ends[(ends[:, 0] != ends[:, 1]).any(axis=1)])
+    tree = shapely.STRtree(edges)
+    num_pairs = -3 * len(edges)  # each edge meets itself and its two neighbours
+    step = max(1, PAIRS_AT_ONCE // max(1, len(edges)))
+    for start in range(0, len(edges), step):
+        num_pairs += len(tree.query(edges[start : start + step], predicate="intersects")[0])
+        if num_pairs > 2 * MOST_CROSSINGS:
             break
-    return count
+    return max(0, num_pairs // 2)
 
 
 def united(polygons: list[Polygon]) -> BaseGeometry:
@@ -214,20 +202,17 @@ def with_derived_ground(box_map: BoxMap) -> BoxMap:
     if not (box_map.kinds == KINDS["Terrain"]).any():
         low, high = box_map.bounds()
         boxes.span("Terrain", low[:2] - VERGE_M, high[:2] + VERGE_M, LAWN_TOP_M - GROUND_SLAB_M, LAWN_TOP_M)
-    houses = [
-        Rectangle((center[0], center[1]), (2 * half[0], 2 * half[1]), turn[1])
-        for center, half, turn in zip(standing.centers, standing.half_extents, standing.rotations_deg, strict=True)
-    ]
-    built = united([rectangle_polygon(house) for house in houses])
+    built = united(footprints(standing).tolist())
     between = shapely.buffer(shapely.buffer(built, NEAR_M / 2), -NEAR_M / 2)
     free = shapely.difference(between, shapely.buffer(built, PAVEMENT_M, join_style="mitre"))
     streets = shapely.buffer(shapely.buffer(free, -NARROW_M / 2), NARROW_M / 2 + 0.5).simplify(0.5)
     for polygon in polygons_of(streets):
         for piece in cover(polygon, min_fill=0.9, min_size_m=6.0, max_size_m=60.0):
             boxes.add("Roads", piece.center, piece.size, -GROUND_SLAB_M, 0.0, piece.yaw_deg)
-    for house in houses:  # one slab under each, so that pavements have the facades' directions and no seams
-        size = house.size[0] + 2 * PAVEMENT_M, house.size[1] + 2 * PAVEMENT_M
-        boxes.add("Sidewalks", house.center, size, -GROUND_SLAB_M, 0.0, house.yaw_deg)
+    # One slab under each house, so that pavements have the facades' directions and no seams.
+    for center, half, turn in zip(standing.centers, standing.half_extents, standing.rotations_deg, strict=True):
+        size = 2 * (half[:2] + PAVEMENT_M)
+        boxes.add("Sidewalks", center[:2], size, -GROUND_SLAB_M, 0.0, turn[1])
     derived = boxes.box_map()
     derived.centers[:, 2] += box_map.ground_z_m
     derived.ids[:] = np.setdiff1d(np.arange(1, len(box_map) + len(derived) + 1), box_map.ids)[: len(derived)]

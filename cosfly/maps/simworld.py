@@ -9,7 +9,7 @@ own surfaces, such as those of `cosfly world`, gets none added. `header.extent_s
 import logging
 from collections import Counter
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import shapely
@@ -109,6 +109,20 @@ class _Node(BaseModel):
         """The location in the world: Unreal's y points right."""
         return np.array([self.location.x * M_PER_CM, -self.location.y * M_PER_CM])
 
+    # The roads.json of a world is not read: in SimWorld's city it has 7 roads, two of which the world lacks, but the
+    # world has 10.
+    @property
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """The ends of the centre line of a road piece, along its x, whose middle is the location."""
+        turn = -np.radians(self.yaw)
+        half = np.array([np.cos(turn), np.sin(turn)]) * ROAD_LENGTH_M / 2
+        return self.xy_m - half, self.xy_m + half
+
+    @property
+    def direction(self) -> np.ndarray:
+        """The direction of a road piece, (2,)."""
+        return (self.ends[1] - self.ends[0]) / ROAD_LENGTH_M
+
 
 class _World(BaseModel):
     nodes: list[_Node] = Field(min_length=1)
@@ -119,21 +133,6 @@ class _Asset(BaseModel):
 
 
 _SizeTable = dict[str, dict[str, _Asset]]  # group (buildings, elements, details) -> asset -> size, cm
-
-
-class Centerline(NamedTuple):
-    """One straight road piece, world metres."""
-
-    start: np.ndarray
-    end: np.ndarray
-
-    @property
-    def direction(self) -> np.ndarray:
-        return (self.end - self.start) / ROAD_LENGTH_M
-
-    @property
-    def yaw_deg(self) -> float:
-        return float(np.degrees(np.arctan2(*self.direction[::-1])))
 
 
 def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
@@ -165,11 +164,10 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
     widths: dict[str, float] = {}
     num_asset_boxes = len(boxes)
     if not has_surfaces:
-        lines = [_centerline(node) for node in road_nodes]
-        widths = _add_roads(boxes, lines)
+        widths = _add_roads(boxes, road_nodes)
         sources["road"] = len(boxes) - num_asset_boxes
         num_asset_boxes = len(boxes)
-        _add_ground_and_paint(boxes, lines, widths)
+        _add_ground_and_paint(boxes, road_nodes, widths)
     tool = "cosfly world" if has_surfaces else "SimWorld city generator"
     header = MapHeader(
         name=cfg.name, source=MapSource(tool=tool, version="world file", file=world.name), licence=cfg.licence,
@@ -221,24 +219,13 @@ def _add_node(boxes: BoxList, node: _Node, asset: Asset, size_cm: np.ndarray, st
     return "default" if is_placeholder else "bbox"
 
 
-def _centerline(node: _Node) -> Centerline:
-    """Return the centre line of a road piece, world metres: the location is its middle, x its direction.
-
-    The roads.json of a world is not read: in SimWorld's city it has 7 roads, two of which the world lacks, but the
-    world has 10.
-    """
-    turn = -np.radians(node.yaw)
-    half = np.array([np.cos(turn), np.sin(turn)]) * ROAD_LENGTH_M / 2
-    return Centerline(node.xy_m - half, node.xy_m + half)
-
-
-def _half_widths(boxes: BoxList, lines: list[Centerline]) -> tuple[float, float]:
+def _half_widths(boxes: BoxList, roads: list[_Node]) -> tuple[float, float]:
     """Return the distances of the kerb and of the fronts from the centre line, m.
 
     Both are tenth percentiles: fronts of the nearest points of buildings, the kerb of the middles of street furniture.
     """
     box_map = boxes.box_map()
-    middles = shapely.multilinestrings([np.stack([line.start, line.end]) for line in lines])
+    middles = shapely.multilinestrings([np.stack(road.ends) for road in roads])
     nearest = shapely.distance(footprints(box_map.select(box_map.kinds == KINDS["Buildings"])), middles)
     fronts = nearest[nearest < BESIDE_ROAD_M].tolist() or [DEFAULT_FRONT_M]
     front = float(np.percentile(fronts, 10))
@@ -251,17 +238,17 @@ def _half_widths(boxes: BoxList, lines: list[Centerline]) -> tuple[float, float]
     return round(kerb, 2), round(max(front, kerb + 1.0), 2)
 
 
-def _add_roads(boxes: BoxList, lines: list[Centerline]) -> dict[str, float]:
+def _add_roads(boxes: BoxList, roads: list[_Node]) -> dict[str, float]:
     """Add carriageways and pavements, without overlaps: a square at every junction, straight pieces between."""
-    if not lines:
+    if not roads:
         return {}
-    kerb, front = _half_widths(boxes, lines)
+    kerb, front = _half_widths(boxes, roads)
     bands = (-front, -kerb), (-kerb, kerb), (kerb, front)  # across a road: pavement, carriageway, pavement
     junctions: dict[tuple[int, int], list[np.ndarray]] = {}
-    for line in lines:
-        for end, away in ((line.start, line.direction), (line.end, -line.direction)):
+    for node in roads:
+        for end, away in zip(node.ends, (node.direction, -node.direction), strict=True):
             junctions.setdefault(tuple(np.round(end).astype(int)), []).append(away)
-        road = boxes.framed(line.start, line.yaw_deg)
+        road = boxes.framed(node.ends[0], float(np.degrees(np.arctan2(*node.direction[::-1]))))
         for band in (1, 0, 2) if 2 * front < ROAD_LENGTH_M else ():  # junctions reach as far as the fronts
             low, high = bands[band]
             road.lay("Roads" if band == 1 else "Sidewalks", (front, low), (ROAD_LENGTH_M - front, high))
@@ -277,12 +264,12 @@ def _add_roads(boxes: BoxList, lines: list[Centerline]) -> dict[str, float]:
     return {"carriageway_m": 2 * kerb, "front_to_front_m": 2 * front}
 
 
-def _add_ground_and_paint(boxes: BoxList, lines: list[Centerline], widths: dict) -> None:
+def _add_ground_and_paint(boxes: BoxList, roads: list[_Node], widths: dict) -> None:
     """Add the ground below everything and dashes on the centre lines, which the source lacks."""
     low, high = boxes.box_map().bounds()
     boxes.span("Terrain", low[:2] - MAP_MARGIN_M, high[:2] + MAP_MARGIN_M, BASE_TOP_M - SLAB_M, BASE_TOP_M)
-    for line in lines:
-        road = boxes.framed(line.start, line.yaw_deg)
+    for node in roads:
+        road = boxes.framed(node.ends[0], float(np.degrees(np.arctan2(*node.direction[::-1]))))
         for start_m in np.arange(widths["carriageway_m"], ROAD_LENGTH_M - widths["carriageway_m"], DASH_STEP_M):
             middle, size = (start_m + DASH_M / 2, 0.0), (DASH_M, DASH_WIDTH_M)
             road.add("RoadLines", middle, size, ROAD_TOP_M - 0.04, PAINT_TOP_M)

@@ -86,7 +86,8 @@ class Plot(BoxList):
             shift = (crown - size) / 2
             low = 2.3 + rng.uniform(0.0, 0.8) + (height * 0.25 if is_top else 0.0)
             top = height * (1.0 if is_top else rng.uniform(0.75, 0.9))
-            self.add("Vegetation", (x + dx * shift, y + dy * shift), (size, size), low, top)
+            if top > low:  # a low tree lacks some
+                self.add("Vegetation", (x + dx * shift, y + dy * shift), (size, size), low, top)
 
     def crossing_paths(self, half_m: float) -> None:
         """Lay two crossing paths, and lawn in the quarters between them."""

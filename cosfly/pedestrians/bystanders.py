@@ -7,15 +7,14 @@ tries, so there may be fewer than requested.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 
 from cosfly.formats.bystanders import PERSON_RADIUS_M, Bystander, Bystanders
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.geometry.axes import headings_of
-from cosfly.pedestrians.speed_model import PACES, STOP_GAP_MIN, PacedRoute, TimedRoute, speeds_at, take_pace
+from cosfly.pedestrians.speed_model import PACES, STOP_GAP_MIN, TimedRoute, timed_route
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround
 from cosfly.runtime.seeding import draw_by_share
 
@@ -29,54 +28,26 @@ GOLDEN = 0.618034  # moments k * GOLDEN % 1 are spread evenly for any number of 
 SPEED_FACTORS = (0.8, 1.2)  # bounds of the factor on the speeds of a pace
 
 
-@dataclass(frozen=True)
-class Trip:
-    """The route of a bystander with its stops.
+def _waiting(route: TimedRoute, before_m: float) -> TimedRoute:
+    """Return a route with a stop of WAIT_S, or a longer one, at least KEEP_BACK_M before a place of it."""
+    stop_m = before_m - KEEP_BACK_M
+    waypoint = max(0, int(np.searchsorted(route.along_m, stop_m, side="right")) - 1)
+    stops_s = route.stops_s.copy()
+    near = _waypoints_near(waypoint)
+    if stops_s[near].any():  # a stop nearby becomes longer instead
+        waypoint = near.start + int(np.argmax(stops_s[near]))
+    stops_s[waypoint] += WAIT_S
+    return replace(route, stops_s=stops_s)
 
-    route: its k waypoints. limits_mps: (k,) speeds there, apart from stops. head_start_s: time on the route before the
-    pedestrian trajectory begins.
-    """
 
-    route: PacedRoute
-    limits_mps: np.ndarray
-    head_start_s: float = 0.0
-
-    @cached_property
-    def timed_distances(self) -> TimedRoute:
-        """The distances along the route as a route of one dimension, with the speeds at its waypoints."""
-        speeds_mps = np.where(self.route.stops_s > 0, 0.0, self.limits_mps)
-        return TimedRoute(self.route.along_m[:, None], speeds_mps, self.route.stops_s)
-
-    def distances_at(self, time_s: np.ndarray) -> np.ndarray:
-        """Return the distance along the route at each time, (n,) m."""
-        return self.timed_distances.sample(time_s + self.head_start_s)[0][:, 0]
-
-    def positions_at(self, along_m: np.ndarray) -> np.ndarray:
-        """Return the positions at distances along the route, (n, 2) m."""
-        route = self.route
-        return np.column_stack([np.interp(along_m, route.along_m, route.polyline_m[:, k]) for k in (0, 1)])
-
-    def waiting(self, before_m: float) -> Trip:
-        """Return the trip with a stop of WAIT_S, or a longer one, at least KEEP_BACK_M before a place of the route."""
-        stop_m = before_m - KEEP_BACK_M
-        waypoint = max(0, int(np.searchsorted(self.route.along_m, stop_m, side="right")) - 1)
-        stops_s = self.route.stops_s.copy()
-        near = _waypoints_near(waypoint)
-        if stops_s[near].any():  # a stop nearby becomes longer instead
-            waypoint = near.start + int(np.argmax(stops_s[near]))
-        stops_s[waypoint] += WAIT_S
-        return replace(self, route=replace(self.route, stops_s=stops_s))
-
-    def with_return(self) -> Trip:
-        """Return the trip with the way back to its start, after a stop at its end or just before."""
-        route = self.route
-        stops_s = np.concatenate([route.stops_s, route.stops_s[-2::-1]])
-        end = len(route.stops_s) - 1
-        if not stops_s[:end][_waypoints_near(end)].any():
-            stops_s[end] = TURN_S
-        both_ways = PacedRoute(np.concatenate([route.polyline_m, route.polyline_m[-2::-1]]), stops_s)
-        limits_mps = np.concatenate([self.limits_mps, self.limits_mps[-2::-1]])
-        return replace(self, route=both_ways, limits_mps=limits_mps)
+def _with_return(route: TimedRoute) -> TimedRoute:
+    """Return a route with the way back to its start, after a stop at its end or just before."""
+    columns = route.polyline_m, route.limits_mps, route.stops_s
+    both_ways = TimedRoute(*(np.concatenate([values, values[-2::-1]]) for values in columns))
+    end = len(route.stops_s) - 1
+    if not route.stops_s[:end][_waypoints_near(end)].any():
+        both_ways.stops_s[end] = TURN_S
+    return both_ways
 
 
 def _waypoints_near(waypoint: int) -> slice:
@@ -93,7 +64,7 @@ def bystanders_of(
     for number in range(cfg.others):
         for _ in range(cfg.num_retries + 1):
             trip = _draw_trip(target, number, ground, cfg, rng)
-            positions_m = None if trip is None else avoid_collisions(trip, target.time_s, np.stack(placed_m))
+            positions_m = None if trip is None else avoid_collisions(*trip, np.stack(placed_m))
             if positions_m is not None:
                 headings_rad = headings_of(positions_m, target.time_s)
                 on_ground_m = np.insert(positions_m, 2, ground.z_m, axis=1)
@@ -103,21 +74,21 @@ def bystanders_of(
     return Bystanders(target.path_id, bystanders)
 
 
-def avoid_collisions(trip: Trip, time_s: np.ndarray, placed_m: np.ndarray) -> np.ndarray | None:
-    """Return the positions, (n, 2) m, on a trip that waits for people already placed; None if waiting does not help.
+def avoid_collisions(route: TimedRoute, time_s: np.ndarray, placed_m: np.ndarray) -> np.ndarray | None:
+    """Return the positions, (n, 2) m, on a route with waits for people already placed; None if these do not help.
 
-    placed_m: (e, n, 2), positions of those people at the same times (n,).
+    time_s: (n,) on the route. placed_m: (e, n, 2), positions of those people then.
     """
     for _ in range(MOST_WAITS + 1):
-        along_m = trip.distances_at(time_s)
-        positions_m = trip.positions_at(along_m)
+        along_m, _ = route.sample(time_s)
+        positions_m = route.positions_at(along_m)
         collisions = np.flatnonzero(gaps_m(positions_m, placed_m) < 0.0)
         if len(collisions) == 0:
             return positions_m
         end_of_step_m = float(along_m[collisions[0] + 1])
         if collisions[0] == 0 and end_of_step_m < KEEP_BACK_M:
             return None
-        trip = trip.waiting(end_of_step_m)
+        route = _waiting(route, end_of_step_m)
     return None
 
 
@@ -140,8 +111,11 @@ def gaps_m(positions_m: np.ndarray, placed_m: np.ndarray) -> np.ndarray:
 
 def _draw_trip(
     target: PedestrianTrajectory, number: int, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator
-) -> Trip | None:
-    """Draw a bystander's trip that passes the target, back and forth for the duration; None if there is none."""
+) -> tuple[TimedRoute, np.ndarray] | None:
+    """Draw a bystander's route that passes the target, back and forth for the duration; None if there is none.
+
+    Return it with its time, (n,) s, at each time of the target.
+    """
     duration_s = float(target.time_s[-1])
     pass_time_s = number * GOLDEN % 1.0 * duration_s
     target_cell = ground.grid.cells_at(target.positions_m[int(np.searchsorted(target.time_s, pass_time_s))])
@@ -153,17 +127,17 @@ def _draw_trip(
     if cells is None:
         return None
     pace = PACES[draw_by_share(cfg.pace, rng)]
-    route = take_pace(ground.grid.centers_of(cells), pace, rng)
-    trip = Trip(route, speeds_at(route, pace, cfg, rng) * rng.uniform(*SPEED_FACTORS))
+    route = timed_route(ground.grid.centers_of(cells), pace, cfg, rng, rng)
+    route = replace(route, limits_mps=route.limits_mps * rng.uniform(*SPEED_FACTORS))
     # The trajectory after a head start of at most its duration needs two durations; 3 leave a margin.
-    while trip.distances_at(3.0 * target.time_s[-1:])[0] >= trip.route.along_m[-1]:
-        trip = trip.with_return()
+    while route.sample(3.0 * target.time_s[-1:])[0][0] >= route.along_m[-1]:
+        route = _with_return(route)
     # The head start moves the nearest pass to the time of this bystander.
     step_s = float(target.time_s[1])
     times_s = pass_time_s + np.arange(0.0, duration_s, step_s)
-    offsets_m = trip.positions_at(trip.distances_at(times_s)) - ground.grid.centers_of(np.array(places[0]))
+    offsets_m = route.positions_at(route.sample(times_s)[0]) - ground.grid.centers_of(np.array(places[0]))
     nearest = np.argmin(np.linalg.norm(offsets_m, axis=1))
-    return replace(trip, head_start_s=float(times_s[nearest]) - pass_time_s)
+    return route, target.time_s + (float(times_s[nearest]) - pass_time_s)
 
 
 def _route_through(

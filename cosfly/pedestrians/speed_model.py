@@ -41,18 +41,23 @@ def menger_curvature(polyline_m: np.ndarray) -> np.ndarray:
 class TimedRoute:
     """A polyline with a speed and a stop at each waypoint.
 
-    polyline_m: (k, d) m, k at least 2, no two neighbours equal. speeds_mps: (k,), 0 at stops. stops_s: (k,) duration of
-    the stop, 0 for none.
+    polyline_m: (k, 2) m, k at least 2, no two neighbours equal. limits_mps: (k,) speeds, except at stops. stops_s: (k,)
+    duration of the stop, 0 for none.
     """
 
     polyline_m: np.ndarray
-    speeds_mps: np.ndarray
+    limits_mps: np.ndarray
     stops_s: np.ndarray
 
     @cached_property
-    def lengths_m(self) -> np.ndarray:
-        """Return the lengths of the pieces, (k - 1,) m."""
-        return np.linalg.norm(np.diff(self.polyline_m, axis=0), axis=1)
+    def along_m(self) -> np.ndarray:
+        """Return the distance along the route to each waypoint, (k,) m."""
+        return distances_along_m(self.polyline_m)
+
+    @cached_property
+    def speeds_mps(self) -> np.ndarray:
+        """Return the speeds at the waypoints, (k,), 0 at stops."""
+        return np.where(self.stops_s > 0, 0.0, self.limits_mps)
 
     @cached_property
     def times_s(self) -> np.ndarray:
@@ -64,16 +69,17 @@ class TimedRoute:
         if not (means_mps > 0).all():
             k = int(np.argmin(means_mps))
             raise ValueError(f"the pedestrian never leaves waypoint {k}: the speed is 0 at waypoints {k} and {k + 1}")
-        return np.concatenate([[0.0], np.cumsum(self.lengths_m / means_mps)])
+        return np.concatenate([[0.0], np.cumsum(np.diff(self.along_m) / means_mps)])
 
     def resample(self, step_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return times (n,) s at equal steps from 0, positions (n, d) m and speeds (n,) m/s; the last is the goal."""
+        """Return times (n,) s at equal steps from 0, positions (n, 2) m and speeds (n,) m/s; the last is the goal."""
         num_samples = int(np.ceil((self.times_s[-1] + self.stops_s.sum()) / step_s - 1e-9)) + 1
         time_s = np.arange(num_samples) * step_s
-        return time_s, *self.sample(time_s)
+        along_m, speeds_mps = self.sample(time_s)
+        return time_s, self.positions_at(along_m), speeds_mps
 
     def sample(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions (n, d) m and speeds (n,) m/s at times (n,) s; the last waypoint after the end.
+        """Return distances along the route (n,) m and speeds (n,) m/s at times (n,) s; the last waypoint after the end.
 
         Within a piece the speed changes evenly from one waypoint to the next.
         """
@@ -84,10 +90,12 @@ class TimedRoute:
         elapsed_s = moving_s - times_s[piece]
         from_mps, to_mps = self.speeds_mps[piece], self.speeds_mps[piece + 1]
         moved_m = from_mps * elapsed_s + 0.5 * (to_mps - from_mps) / duration_s * elapsed_s**2
-        share = np.clip(moved_m / self.lengths_m[piece], 0.0, 1.0)
-        start_m = self.polyline_m[piece]
-        positions_m = start_m + share[:, None] * (self.polyline_m[piece + 1] - start_m)
-        return positions_m, from_mps + (to_mps - from_mps) * elapsed_s / duration_s
+        along_m = np.clip(self.along_m[piece] + moved_m, self.along_m[piece], self.along_m[piece + 1])
+        return along_m, from_mps + (to_mps - from_mps) * elapsed_s / duration_s
+
+    def positions_at(self, along_m: np.ndarray) -> np.ndarray:
+        """Return the positions at distances along the route, (n, 2) m."""
+        return np.column_stack([np.interp(along_m, self.along_m, self.polyline_m[:, k]) for k in (0, 1)])
 
 
 def standing_time_s(time_s: np.ndarray, times_s: np.ndarray, stops_s: np.ndarray) -> np.ndarray:
@@ -126,62 +134,50 @@ PACES = {
 }
 
 
-@dataclass(frozen=True)
-class PacedRoute:
-    """A route after a pace is applied: polyline_m (k, 2); stops_s (k,), duration of the stop at each waypoint."""
+def take_pace(route_m: np.ndarray, pace: Pace, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Apply a pace to a route, (k, 2) m: return its waypoints, (m, 2) m, and the duration of the stop at each, (m,) s.
 
-    polyline_m: np.ndarray
-    stops_s: np.ndarray
-
-    @classmethod
-    def without_stops(cls, polyline_m: np.ndarray) -> PacedRoute:
-        return cls(polyline_m, np.zeros(len(polyline_m)))
-
-    @cached_property
-    def along_m(self) -> np.ndarray:
-        """Return the distance along the route to each waypoint, (k,) m."""
-        return distances_along_m(self.polyline_m)
-
-
-def take_pace(route_m: np.ndarray, pace: Pace, rng: np.random.Generator) -> PacedRoute:
-    """Apply a pace to a route, (k, 2) m. There are no stops at its ends; a route of two points is unchanged."""
+    There are no stops at its ends; a route of two points is unchanged.
+    """
     if len(route_m) < 3:
-        return PacedRoute.without_stops(route_m)
+        return route_m, np.zeros(len(route_m))
     polyline_m = route_m
     turn = len(route_m) - 1
     if pace.turn_at is not None:
         turn = int(np.clip(round(rng.uniform(*pace.turn_at) * turn), 1, turn))
         num_back = max(1, round(rng.uniform(*pace.back) * turn))
         polyline_m = np.concatenate([route_m[: turn + 1], route_m[turn - num_back : turn][::-1]])
-    route = PacedRoute.without_stops(polyline_m)
+    stops_s = np.zeros(len(polyline_m))
     if pace.turn_at is not None:
-        route.stops_s[turn] = rng.uniform(*pace.stop_s)
+        stops_s[turn] = rng.uniform(*pace.stop_s)
     if pace.stop_every_m is not None:
+        along_m = distances_along_m(polyline_m)
         next_m = rng.uniform(*pace.stop_every_m)
         first_allowed = 1
-        while next_m < route.along_m[-1]:
-            waypoint = max(int(np.searchsorted(route.along_m, next_m)), first_allowed)
+        while next_m < along_m[-1]:
+            waypoint = max(int(np.searchsorted(along_m, next_m)), first_allowed)
             if waypoint >= len(polyline_m) - 1:
                 break
-            route.stops_s[waypoint] = rng.uniform(*pace.stop_s)
-            next_m = route.along_m[waypoint] + rng.uniform(*pace.stop_every_m)
+            stops_s[waypoint] = rng.uniform(*pace.stop_s)
+            next_m = along_m[waypoint] + rng.uniform(*pace.stop_every_m)
             first_allowed = waypoint + STOP_GAP_MIN
-    return route
+    return polyline_m, stops_s
 
 
-def speeds_at(route: PacedRoute, pace: Pace, cfg: PedestriansConfig, rng: np.random.Generator) -> np.ndarray:
-    """Return the speeds at the waypoints of a paced route, (k,) m/s, 0 at stops (eq:speed).
+def timed_route(route_m: np.ndarray, pace: Pace, cfg: PedestriansConfig, rng: np.random.Generator,
+                pace_rng: np.random.Generator) -> TimedRoute:  # fmt: skip
+    """Return a route, (k, 2) m, at a pace, with the speeds of eq:speed.
 
-    No other speed is below SLOWEST_SPEED_MPS. With the default settings eq:speed gives at least 0.067 m/s (a right
-    angle of two 0.5 m steps), so that this bound has no effect.
+    No speed is below SLOWEST_SPEED_MPS. With the default settings eq:speed gives at least 0.067 m/s (a right angle of
+    two 0.5 m steps), so that this bound has no effect.
     """
+    polyline_m, stops_s = take_pace(route_m, pace, pace_rng)
     cruise_mps = cfg.cruise_speed_mps
     fastest_mps = cfg.max_speed_mps
     if pace.hurries:
         cruise_mps = cfg.hurry_speed_mps
         fastest_mps = max(cfg.max_speed_mps, cfg.hurry_speed_mps)
-    jitter = 1.0 + cfg.speed_jitter * rng.uniform(-1.0, 1.0, size=len(route.polyline_m))
-    speeds_mps = cruise_mps / (1.0 + cfg.curvature_gain_m * menger_curvature(route.polyline_m)) * jitter
-    speeds_mps = np.clip(speeds_mps, max(cfg.min_speed_mps, SLOWEST_SPEED_MPS), fastest_mps)
-    speeds_mps[route.stops_s > 0] = 0.0
-    return speeds_mps
+    jitter = 1.0 + cfg.speed_jitter * rng.uniform(-1.0, 1.0, size=len(polyline_m))
+    limits_mps = cruise_mps / (1.0 + cfg.curvature_gain_m * menger_curvature(polyline_m)) * jitter
+    limits_mps = np.clip(limits_mps, max(cfg.min_speed_mps, SLOWEST_SPEED_MPS), fastest_mps)
+    return TimedRoute(polyline_m, limits_mps, stops_s)

@@ -22,7 +22,7 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory, pace_field, pa
 from cosfly.formats.roi import read_roi
 from cosfly.pedestrians.astar import route_cost
 from cosfly.pedestrians.bystanders import bystanders_of
-from cosfly.pedestrians.speed_model import PACES, TimedRoute, speeds_at, take_pace
+from cosfly.pedestrians.speed_model import PACES, timed_route
 from cosfly.pedestrians.walkable import (
     CROSSING,
     ROAD,
@@ -74,9 +74,8 @@ def follow_route(
 ) -> PedestrianTrajectory:  # fmt: skip
     """Return the trajectory along a route, (k, 2) m, at a pace; None: one that is drawn by its share."""
     name = pace or draw_by_share(cfg.pace, pace_rng)
-    route = take_pace(route_m, PACES[name], pace_rng)
-    timed_route = TimedRoute(route.polyline_m, speeds_at(route, PACES[name], cfg, rng), route.stops_s)
-    time_s, positions_m, speeds_mps = timed_route.resample(cfg.dt_s)
+    route = timed_route(route_m, PACES[name], cfg, rng, pace_rng)
+    time_s, positions_m, speeds_mps = route.resample(cfg.dt_s)
     on_ground = np.insert(positions_m, 2, ground_z_m, axis=1)
     return PedestrianTrajectory(path_id, route.polyline_m, time_s, on_ground, speeds_mps, name)
 

@@ -6,7 +6,7 @@ them (`min_fill`, `min_canopy_fill`); *crop_tree* leaves stems below the cut, no
 can walk below a tree (`trunk`). The variants of the paper's SimWorld runs (app:simworld:step3) are settings.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
@@ -17,8 +17,8 @@ from pydantic import Field
 from cosfly.formats.boxes import BoxMap, SimplifyPass
 from cosfly.formats.kinds import KINDS, SURFACE_KINDS
 from cosfly.formats.meshes import Meshes
-from cosfly.geometry.axes import axis_aligned_half_extents
-from cosfly.runtime.compiled import njit
+from cosfly.geometry.axes import axis_aligned_half_extents, box_corners
+from cosfly.geometry.grid import TOUCH_M, mark_hulls
 from cosfly.runtime.config import Config
 
 VEGETATION = KINDS["Vegetation"]
@@ -51,14 +51,14 @@ def merge(
         for group in np.unique(split[of_kind]):
             rows = np.flatnonzero(of_kind & (split == group))
             labels[rows] = rows[clusters(lows[rows], highs[rows], gap_m)]
+    half, turns = _upright(box_map, np.arange(len(box_map)))
+    footprints = box_corners(box_map.centers, half + CLOSED_GAP_M / 2, np.radians(turns[:, 1]))[:, [0, 2, 6, 4], :2]
     order = np.argsort(labels, kind="stable")
-    starts = np.flatnonzero(np.r_[True, labels[order][1:] != labels[order][:-1], True]) if len(order) else order
-    # Footprints as centre, unit axes and half sizes: a turned box covers its own rectangle, not its bounds.
-    is_tilted = (box_map.rotations_deg[:, [0, 2]] != 0).any(axis=1)
-    half = np.where(is_tilted[:, None], ((maxs - mins) / 2)[:, :2], box_map.half_extents[:, :2]) + CLOSED_GAP_M / 2
-    yaw = np.where(is_tilted, 0.0, np.radians(box_map.rotations_deg[:, 1]))
-    rectangles = np.column_stack([box_map.centers[:, :2], np.cos(yaw), np.sin(yaw), half])
-    labels = _halve(order, starts, rectangles, mins[:, :2].copy(), maxs[:, :2].copy(), min_fill, labels.copy())
+    _, starts, sizes = np.unique(labels[order], return_index=True, return_counts=True)
+    for start, size in zip(starts[sizes > 1], sizes[sizes > 1], strict=True):
+        cluster = order[start : start + size]
+        for part in _halved(cluster, box_map.centers, footprints, mins[:, :2], maxs[:, :2], min_fill[cluster[0]]):
+            labels[part] = part.min()
     order = np.lexsort((box_map.ids, labels))
     if len(order) == 0:
         return box_map
@@ -97,60 +97,32 @@ def _near_pairs(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> tuple[np.nd
     return first[is_near], second[is_near]
 
 
-@njit(cache=True)
-def _halve(order, starts, rectangles, mins, maxs, min_fill, labels):  # pragma: no cover (compiled)
-    """Return labels, the lowest row of each part, after halving clusters that fill too little: runs of `order`."""
-    stack = np.empty((128, 2), dtype=np.int64)  # halves are at most 64 deep
-    for cluster in range(len(starts) - 1):
-        stack[0, 0], stack[0, 1] = starts[cluster], starts[cluster + 1]
-        size = 1
-        while size > 0:
-            size -= 1
-            start, stop = stack[size, 0], stack[size, 1]
-            part = order[start:stop].copy()
-            labels[part] = part.min()
-            if len(part) == 1 or min_fill[part[0]] <= 0.0:
-                continue
-            low, high = mins[part[0]].copy(), maxs[part[0]].copy()
-            members = rectangles[part]
-            for row in part:
-                for k in range(2):
-                    low[k] = min(low[k], mins[row, k])
-                    high[k] = max(high[k], maxs[row, k])
-            if fill_share(members, low, high) >= min_fill[part[0]]:
-                continue
-            axis = 0 if high[0] - low[0] >= high[1] - low[1] else 1
-            ranks = np.argsort(members[:, axis], kind="mergesort")
-            order[start:stop] = part[ranks]
-            middle = (start + stop) // 2
-            stack[size, 0], stack[size, 1] = start, middle
-            stack[size + 1, 0], stack[size + 1, 1] = middle, stop
-            size += 2
-    return labels
+def _halved(
+    cluster: np.ndarray, centers: np.ndarray, footprints: np.ndarray, mins: np.ndarray, maxs: np.ndarray,
+    min_fill: float,
+) -> Iterator[np.ndarray]:  # fmt: skip
+    """Yield the rows of a cluster in parts that cover at least `min_fill` of the rectangle around them."""
+    waiting = [cluster]
+    while waiting:
+        part = waiting.pop()
+        low, high = mins[part].min(axis=0), maxs[part].max(axis=0)
+        if len(part) == 1 or min_fill <= 0.0 or _fill_share(footprints[part], low, high) >= min_fill:
+            yield part
+            continue
+        axis = int(high[1] - low[1] > high[0] - low[0])
+        waiting += np.split(part[np.argsort(centers[part, axis], kind="stable")], [len(part) // 2])
 
 
-@njit(cache=True)
-def fill_share(rectangles, low, high):  # pragma: no cover (compiled)
-    """Return the share of a rectangle's area that turned rectangles cover, by cell centres."""
+def _fill_share(footprints: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
+    """Return the share of a rectangle's area that turned rectangles, (n, 4, 2) m, cover, by cell centres."""
     size = high - low
-    if size[0] <= 0.0 or size[1] <= 0.0:
+    if size.min() <= 0.0:
         return 1.0
-    cell = max(size[0], size[1]) / FILL_CELLS
-    num_x, num_y = max(1, round(size[0] / cell)), max(1, round(size[1] / cell))
-    step_x, step_y = size[0] / num_x, size[1] / num_y
-    covered = np.zeros((num_y, num_x), dtype=np.bool_)
-    for x, y, cos, sin, half_x, half_y in rectangles:
-        reach_x = abs(cos) * half_x + abs(sin) * half_y
-        reach_y = abs(sin) * half_x + abs(cos) * half_y
-        first_row, last_row = int((y - reach_y - low[1]) / step_y), int((y + reach_y - low[1]) / step_y)
-        first_column, last_column = int((x - reach_x - low[0]) / step_x), int((x + reach_x - low[0]) / step_x)
-        for row in range(max(0, first_row), min(num_y, last_row + 1)):
-            dy = low[1] + (row + 0.5) * step_y - y
-            for column in range(max(0, first_column), min(num_x, last_column + 1)):
-                dx = low[0] + (column + 0.5) * step_x - x
-                if abs(dx * cos + dy * sin) <= half_x and abs(dy * cos - dx * sin) <= half_y:
-                    covered[row, column] = True
-    return covered.sum() / covered.size
+    num_cells = np.maximum(1, np.round(FILL_CELLS * size / size.max())).astype(int)
+    covered = np.zeros(num_cells[::-1], dtype=np.uint8)
+    counts, marks = np.full(len(footprints), 4), np.ones(len(footprints), dtype=np.uint8)
+    mark_hulls((footprints - low) / (size / num_cells), counts, 0.5 - TOUCH_M, marks, covered)
+    return float(covered.mean())
 
 
 class SimplifyConfig(Config):

@@ -53,20 +53,14 @@ def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
     return facts
 
 
-def report(raw: BoxMap, result: Simplification, cfg: SimplifyConfig) -> dict:
+def report(raw: BoxMap, result: Simplification) -> dict:
     """Return the content of `simplify_report.json`."""
-    trunks = {}
-    if cfg.crop_tree and cfg.crop_strategy == "fixed":  # the walkable area of both rules for trunks
-        names = ("cell_agreement", "iou", "simplified_walkable_m2", "simplified_largest_part_m2")
-        for trunk in ("stem", "full"):
-            grid = cross_validate(raw, simplify(raw, cfg.model_copy(update={"trunk": trunk})).box_map)
-            trunks[trunk] = {name: grid[name] for name in names}
     obstacles = {"raw": int(blocks_walking(raw).sum()), "simplified": int(blocks_walking(result.box_map).sum())}
     return {
         **REPORT_FORMAT.header, "name": raw.name, "num_boxes": {"raw": len(raw), "simplified": len(result.box_map)},
         "obstacles_at_walking_height": obstacles,
         "passes": [{"pass": name, "num_boxes": sum(c.values()), "counts": c} for name, c in result.passes],
-        "grid": cross_validate(raw, result.box_map), "trunks": trunks,
+        "grid": cross_validate(raw, result.box_map),
     }  # fmt: skip
 
 
@@ -86,7 +80,7 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path) -> Path:
             fix="correct ground_z_m in the header of the map",
         )
     write_boxes(product, result.box_map)
-    facts = report(raw, result, cfg)
+    facts = report(raw, result)
     write_json(out / "simplify_report.json", facts)
     view = TopView.around(np.stack(raw.bounds()), PICTURE_PX)
     halves = []
@@ -96,7 +90,8 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path) -> Path:
         text = f"{title}: {len(box_map)} boxes, {area:.0f} m2 walkable (drawn: boxes below 2 m)"
         halves.append(add_caption(draw_map(shown, view), text))
     write_bytes(out / "simplify.png", png_bytes(np.hstack(halves)))
-    log.info("simplified %d boxes to %d", len(raw), len(result.box_map))
+    num_new = len(np.setdiff1d(result.box_map.ids, raw.ids))
+    log.info("%d boxes became %d, of which %d are stems and pieces of trees", len(raw), len(result.box_map), num_new)
     tally = Tally(input=1, kept=1)
     stage.finish([product, out / "simplify_report.json", out / "simplify.png"], tally, num_boxes=facts["num_boxes"])
     return product

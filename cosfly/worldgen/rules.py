@@ -41,10 +41,11 @@ _HEIGHT = (  # "12 m", "3-storey", but not the "12 m" of "12 m wide"
     rf"(?P<number>{_NUMBER})[ -]?(?P<unit>m|metres?|meters?|floors?|storeys?|stor(?:y|ies)|levels?)\b"
     r"(?! (?:wide|long|x|by))(?: high| tall| in height)?"
 )
-# A width, which is not used: "12 m wide", "streets of 20 m"
+# A width, which is not used: "12 m wide", "streets of at most 20 m", "a river of 30 to 40 m"
 _WIDTH = (
-    rf"\b(?:street|road|lane|alley|avenue)s?(?: (?:width|are|is|of))* {_NUMBER} ?{_LENGTH}(?: wide| in width)?"
-    rf"|{_NUMBER} ?{_LENGTH}[- ]wide\b"
+    r"\b((?:street|road|lane|alley|avenue|boulevard|pavement|sidewalk|footpath|path|promenade|river|canal)s?)"
+    r"(?: (?:width|are|is|of|between|at most|at least|up to|about|over|under|more than|less than))* "
+    rf"(?:\d+ ?(?:m )?(?:to|and|-) ?)?{_NUMBER} ?{_LENGTH}(?: wide| in width)?|{_NUMBER} ?{_LENGTH}[- ]wide\b"
 )
 _HEIGHTS = {
     # "no building is higher than 20 m", "up to 3 floors"
@@ -174,7 +175,7 @@ class _Reader:
         """Take measures and nouns. Each is taken before those that would misread it."""
         # Measures are before nouns, which their numbers do not count.
         self.sizes = {name: match for name, pattern in _SIZES.items() if (match := self._take(pattern))}
-        while match := self._take(_WIDTH):  # before heights and the word "wide", which would misread it
+        while match := self._take(_WIDTH, keep=r"\1 ,"):  # before heights and the word "wide", which would misread it
             self.not_used.append(match[0].strip())
         self.heights = {name: match for name, pattern in _HEIGHTS.items() if (match := self._take(pattern))}
         for name in [name for name in self.heights if name != "at_least"][1:]:  # highest ones after the first
