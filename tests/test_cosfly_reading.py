@@ -82,7 +82,7 @@ def test_a_list_of_empty_objects_is_refused_at_the_first(tmp_path, field):
     (tmp_path / "release.json").write_text(json.dumps(head))
     tracemalloc.start()
     try:
-        with pytest.raises(InputError, match=r"release\.json: name: Field required") as caught:
+        with pytest.raises(InputError, match=r"release\.json: name: the field is missing") as caught:
             read_record(tmp_path / "release.json")
         assert tracemalloc.get_traced_memory()[1] < 10e6
     finally:

@@ -55,7 +55,8 @@ class Bystander:
     def from_json(cls, record: dict, where: str) -> Bystander:
         if (kind := record.get("kind")) != KIND:
             what = "the kind of the bystander is unknown"
-            raise InputError(what, where=f"{where}.kind", got=shown(kind), expected=KIND)
+            fix = "make the pedestrian trajectories again"
+            raise InputError(what, where=f"{where}.kind", got=shown(kind), expected=KIND, fix=fix)
         positions_m = columns(record, "xyz", where)
         yaw = column(record, "yaw", where, len(positions_m))
         return cls(positions_m, np.radians(yaw), record.get("look_alike") is True)

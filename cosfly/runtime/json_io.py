@@ -139,6 +139,8 @@ def validated(kind: type[Kind], value: Any, where: str | Path) -> Kind:
         detail = error.errors(include_url=False, include_context=False)[0]
         parts = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in detail["loc"])
         field = "".join(parts).removeprefix(".") or "top level"
+        if detail["type"] == "missing":
+            raise InputError(MISSING, where=f"{where}: {field}") from None
         is_object_error = detail["type"] in ("model_type", "dataclass_type")
         what = "the value is not an object" if is_object_error else plain(detail["msg"])
         raise InputError(what, where=f"{where}: {field}", got=shown(detail["input"])) from None
