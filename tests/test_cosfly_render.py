@@ -17,7 +17,7 @@ from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.people import Appearance, People
 from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
-from cosfly.geometry.axes import focal_px, intrinsic_matrix, look_at, wrap_deg
+from cosfly.geometry.axes import focal_px, intrinsic_matrix, look_at, project, wrap_deg
 from cosfly.geometry.goals import SIDES, target_picture
 from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.render.camera import rendered_visibility, view_target
@@ -449,6 +449,25 @@ def test_what_a_wall_hides_is_not_said(y_m, says_legs):
     assert goal is not None
     assert (goal.frame, "legs" in goal.says) == (3, says_legs)
     assert bool({*goal.says} & {*SIDES}) != says_legs  # where they are hidden, a place is said
+
+
+def test_a_person_casts_a_shadow_away_from_the_sun():
+    hip_m, look = np.array([0.0, 0.0, 0.9]), Look()
+    ground = make_box_map([[0.0, 0.0, -0.5]], [[40.0, 40.0, 0.5]], [[0.0] * 3], [KINDS["Roads"]])
+    intrinsic, renderer = intrinsic_matrix(320, 180, 60.0), open_renderer("gl", ground, 320, 180, look)
+    renderer.prepare(np.full(3, -30.0), np.full(3, 30.0))
+    pose = pose_towards([0.0, -6.0, 8.0], hip_m)
+    person = PosedPerson(hip_m, 0.0, 0.5, 1.0, choose_clothes(np.random.default_rng(0), LOOKS))
+    with_person, without = (renderer.render(pose, intrinsic, people) for people in ({PERSON_ID: person}, {}))
+    renderer.close()
+    sun = look.sun_direction()
+    reach_m = hip_m[2] / sun[2] * sun[:2]
+    on_ground = [[*-reach_m, 0.0], [*reach_m, 0.0]]  # of the sun's ray through the hip, and opposite
+    columns, rows = project(np.array(on_ground), pose, intrinsic)[0].astype(int).T
+    assert (with_person.ids[rows, columns] != PERSON_ID).all()
+    brightness = with_person.rgb[rows, columns].mean(axis=1) / without.rgb[rows, columns].mean(axis=1)
+    assert brightness[0] < 0.8
+    assert brightness[1] == pytest.approx(1.0, abs=0.02)
 
 
 @pytest.fixture(scope="session")
