@@ -39,6 +39,8 @@ def assert_houses_stand_apart_at_pavements(town: Town) -> None:
     paved = shapely.union_all(footprints(town.boxes.select(of_kinds(town.boxes, "Sidewalks", "Roads"))))
     first, second = shapely.STRtree(houses).query(shapely.buffer(houses, -0.05), predicate="intersects")
     assert (first == second).all()
+    objects = footprints(town.placement.select(of_kinds(town.placement, "Buildings")))
+    assert not shapely.STRtree(houses).query(shapely.buffer(objects, -0.05), predicate="intersects").size
     assert (shapely.distance(houses, paved) < 2.0).all()
 
 
