@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 from commands import working_here
 from specimens_distill import make_caption as caption_of_frame
 
-from cosfly.formats.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
+from cosfly.formats.captions import Caption, write_captions
 from cosfly.formats.inspection import (
     RESULTS,
     Funnel,
@@ -43,24 +43,16 @@ REPAIR = {"strategy": "anchored", "asks": 1, "first_decision": "hover", "first_v
 
 def make_caption(flight, index: int, **change) -> Caption:
     """Give a caption in slots of one frame; every fourth was repaired, of every second sentences were read."""
-    decision = ("track_straight", "ascend", "yaw_left_to_follow")[index % 3]
-    prompt = Prompt(system="s", user=f"u {PICTURES_MARK}")
-    english = f"A person walks {index} m ahead", "The person walks on, so fly on behind"
-    chinese = f"前方 {index} 米处的行人", "行人继续直行, 因此跟随"
-    texts = [
-        Coc(critical_components=first, reasoning_trace=last, flight_decision=decision)
-        for first, last in (english, chinese)
-    ]
+    plain = caption_of_frame(flight.town, flight.trajectory, flight.variant, index)
+    is_straight = plain.en.flight_decision == "track_straight"
     own = {
-        "future": [index + 1], "prompt": {"en": prompt, "zh": prompt}, "picture_px": (96, 54), "en": texts[0],
-        "zh": texts[1], "teacher": {"kind": "rules", "model": "rules-1", "settings": {"seed": 0}},
-        "label_from": "flight" if flight.is_original else "twin", "label": "track_straight",
-        "verdict": "CONSISTENT" if decision == "track_straight" else "SOFT_CONFLICT",
+        "sample_id": f"{flight.flight_id}_frame_{index:05d}", "future": [index + 1], "picture_px": (96, 54),
+        "teacher": {"kind": "rules", "model": "rules-1", "settings": {"seed": 0}},
+        "label": "track_straight", "verdict": "CONSISTENT" if is_straight else "SOFT_CONFLICT",
         "repair": REPAIR if index % 4 == 0 else None, "writing": "slots",
         "checks": {"values": {"en": {"values_filled": 2}}} if index % 2 else {},
     }  # fmt: skip
-    own["sample_id"] = f"{flight.flight_id}_frame_{index:05d}"
-    return caption_of_frame(flight.town, flight.trajectory, flight.variant, index, **{**own, **change})
+    return Caption.model_validate({**plain.model_dump(), **own, **change})
 
 
 def make_inspection(tree: Path, rejected: dict[str, tuple[str, str]]) -> Inspection:

@@ -20,6 +20,7 @@ from cosfly.runtime.journal import Journal
 client.FIRST_PAUSE_S = client.LOADING_PAUSE_S = 0.01  # no test waits for a server that fails
 client.LONGEST_PAUSE_S = 0.02
 MODEL = "test-teacher"
+USAGE = {"prompt_tokens": 1000, "completion_tokens": 100}
 ENGLISH = {
     "critical_components": "The target pedestrian is {visibility} and walks on the road ahead of the drone.",
     "reasoning_trace": "The line of sight is free and the motion is regular, so this manoeuvre keeps the target in "
@@ -137,6 +138,11 @@ def obedient_answer(server: TeacherServer, body: dict, fault: str | None = None)
     return {**texts, **fields, "flight_decision": decision}
 
 
+def completion(body: dict, text: str) -> dict:
+    choice = {"index": 0, "message": {"role": "assistant", "content": text}, "finish_reason": "stop"}
+    return {"id": "x", "object": "chat.completion", "model": body["model"], "choices": [choice], "usage": USAGE}
+
+
 def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
@@ -181,11 +187,7 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
         def _send_answer(self, body: dict, fault: str | None) -> None:
             write = TEXT_FAULTS.get(fault or "", lambda value: json.dumps(value, ensure_ascii=False))
             text = server.text(body) if server.text else write(obedient_answer(server, body, fault))
-            choice = {"index": 0, "message": {"role": "assistant", "content": text}, "finish_reason": "stop"}
-            usage = {"prompt_tokens": 1000, "completion_tokens": 100}
-            reply = {"id": "x", "object": "chat.completion", "model": body["model"]}
-            reply |= {"choices": [choice], "usage": usage}
-            self._send_bytes(200, json.dumps(reply, ensure_ascii=False).encode())
+            self._send_bytes(200, json.dumps(completion(body, text), ensure_ascii=False).encode())
 
         def _send_anything(self, sent: tuple[int, dict] | Sent | Wild) -> None:
             if isinstance(sent, Sent):

@@ -22,7 +22,7 @@ import pytest
 from commands import invoke
 from specimens_captions import VOCABULARY, deciding
 from specimens_captions import settings as quick
-from teacher_server import ENGLISH, MODEL, Sent, TeacherServer, Wild, obedient_answer, refusal
+from teacher_server import ENGLISH, MODEL, USAGE, Sent, TeacherServer, Wild, completion, obedient_answer, refusal
 
 from caption.schema import CaptionConfig
 from caption.stage.stage import run
@@ -57,10 +57,7 @@ def whole(tree, tmp_path_factory) -> bytes:
 
 
 def answer(body: dict) -> dict:
-    with_text = json.dumps(obedient_answer(_OBEDIENT, body), ensure_ascii=False)
-    choice = {"index": 0, "message": {"role": "assistant", "content": with_text}, "finish_reason": "stop"}
-    usage = {"prompt_tokens": 1000, "completion_tokens": 100}
-    return {"id": "x", "object": "chat.completion", "model": body["model"], "choices": [choice], "usage": usage}
+    return completion(body, json.dumps(obedient_answer(_OBEDIENT, body), ensure_ascii=False))
 
 
 _OBEDIENT = deciding()
@@ -191,7 +188,6 @@ def events(body: dict) -> Sent:
     return Sent(200, "\n\n".join(lines).encode())
 
 
-USAGE = {"prompt_tokens": 1000, "completion_tokens": 100}
 DECLINED_WORDS = "I'm sorry, I can't help with following a person."
 
 

@@ -373,15 +373,9 @@ def test_at_most_a_twentieth_of_the_walked_points_of_shipped_towns_is_on_the_roa
     assert paper > 0.1
 
 
-def test_even_speed_gives_even_steps_and_ends_at_the_goal():
-    polyline = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.3]])
-    speeds = np.full(3, 1.0)
-    time_s, positions, sampled = TimedRoute(polyline, speeds, np.zeros(3)).resample(0.5)
-    np.testing.assert_allclose(time_s, [0, 0.5, 1.0, 1.5, 2.0, 2.5])
-    np.testing.assert_allclose(positions, [[0, 0], [0.5, 0], [1, 0], [1, 0.5], [1, 1.0], [1, 1.3]], atol=1e-12)
-    np.testing.assert_allclose(sampled, 1.0)
-    time_s, positions, _ = TimedRoute(polyline[:2], np.ones(2), np.zeros(2)).resample(0.5)
-    np.testing.assert_allclose(time_s, [0.0, 0.5, 1.0])  # one that ends on a step has no second last point
+def test_a_route_that_ends_on_a_step_has_no_second_last_point():
+    time_s, positions, _ = TimedRoute(np.array([[0.0, 0.0], [1.0, 0.0]]), np.ones(2), np.zeros(2)).resample(0.5)
+    np.testing.assert_allclose(time_s, [0.0, 0.5, 1.0])
     np.testing.assert_allclose(positions[-1], [1.0, 0.0])
 
 
@@ -394,6 +388,7 @@ def test_samples_agree_with_a_walk_in_tiny_steps(seed, count):
     route = TimedRoute(polyline, speeds, np.zeros(count))
     times = route.times_s
     time_s, positions, sampled = route.resample(0.5)
+    np.testing.assert_allclose(time_s, 0.5 * np.arange(len(time_s)))
     # The slow way: speed is linear in time between waypoints, the way walked is its integral.
     fine_s = np.linspace(0.0, times[-1], 200_001)
     fine_mps = np.interp(fine_s, times, speeds)

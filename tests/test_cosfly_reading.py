@@ -239,18 +239,6 @@ def _frame(tree: Path) -> Path:
     return frame
 
 
-def test_a_link_out_of_the_tree_is_refused_unless_the_tree_is_trusted(tmp_path):
-    private = tmp_path / "private.npy"
-    private.write_bytes(DEPTH)
-    frame = _frame(tmp_path / "tree")
-    (frame / "depth.npy").symlink_to(private)
-    with pytest.raises(
-        InputError, match=r"a symbolic link leads out of its folder; got .*private\.npy; .*--set follow_links=true"
-    ):
-        read_depth(frame)
-    assert read_depth(LinkedPath(frame)).shape == (4, 4)
-
-
 def test_one_command_follows_links_and_the_next_in_this_process_does_not(tmp_path):
     tree = make_playback_tree(tmp_path / "data/tree", 1, 4, with_augmented=False)
     (picture,) = tree.rglob("frame_00001/rgb.png")

@@ -17,12 +17,11 @@ from toy_workers import items_of, make_faulty, stage_in
 
 import cosfly
 from cosfly.llm.contract import run_until_interrupted
-from cosfly.runtime.config import Config
 from cosfly.runtime.errors import EnvironmentMissing, InputError, StorageError
 from cosfly.runtime.events import LOSSES, read_events
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.pool import Watch, run_items
-from cosfly.runtime.run_dir import Failed, Kept, StageFolder
+from cosfly.runtime.run_dir import Failed, Kept
 from cosfly.runtime.seeding import random_bytes, rng_for
 from cosfly.runtime.worker import Item, Outcome
 
@@ -49,10 +48,6 @@ def make_worker(log: Path):
     return work
 
 
-def _stage(path: Path) -> StageFolder:
-    return StageFolder.open(path, "demo", config=Config(), inputs={}, seed=0)
-
-
 def _items(*payloads):
     return [Item(f"i{k}", payload) for k, payload in enumerate(payloads)]
 
@@ -61,7 +56,7 @@ MIXED = (("keep", 2), ("drop", "short"), ("fail", "x"), ("keep", 3), ("bug", "y"
 
 
 def test_everything_is_counted(tmp_path):
-    finished = run_items(_stage(tmp_path / "s"), _items(*MIXED), make_worker, (tmp_path / "log",))
+    finished = run_items(stage_in(tmp_path), _items(*MIXED), make_worker, (tmp_path / "log",))
     found = finished.tally.model_dump()
     assert found == {"input": 6, "kept": 2, "dropped": {"short": 2}, "failed": {"bug": 1, "input": 1}}
     assert [record.id for record in finished.kept] == ["i0", "i3"]
@@ -71,7 +66,7 @@ def test_everything_is_counted(tmp_path):
 
 
 def test_a_record_is_the_last_of_its_item_and_a_failure_undoes_nothing(tmp_path):
-    stage = _stage(tmp_path / "s")
+    stage = stage_in(tmp_path)
     with stage.journal as journal:
         for record in (
             Failed(id="i0", code="input", message="at first"), Kept(id="i0", result={"square": 4}),
@@ -90,7 +85,7 @@ def test_a_record_is_the_last_of_its_item_and_a_failure_undoes_nothing(tmp_path)
 
 def test_worker_count_does_not_matter(tmp_path):
     def products(workers: int):
-        stage = _stage(tmp_path / f"s{workers}")
+        stage = stage_in(tmp_path / str(workers))
         finished = run_items(stage, _items(*MIXED), make_worker, (tmp_path / "log",), workers=workers)
         return dump_json([r.model_dump(exclude={"seconds"}) for r in finished.records]), finished.tally
 
@@ -98,7 +93,7 @@ def test_worker_count_does_not_matter(tmp_path):
 
 
 def test_finished_items_are_not_done_again_and_failed_ones_are(tmp_path):
-    stage, log = _stage(tmp_path / "s"), tmp_path / "log"
+    stage, log = stage_in(tmp_path), tmp_path / "log"
     first = run_items(stage, _items(*MIXED), make_worker, (log,))
     log.unlink()
     second = run_items(stage, _items(*MIXED), make_worker, (log,))
@@ -109,15 +104,15 @@ def test_finished_items_are_not_done_again_and_failed_ones_are(tmp_path):
 def test_a_dying_worker_loses_no_other_item_and_leaves_the_stage_open(tmp_path):
     payloads = [("keep", k) for k in range(5)]
     payloads[2] = ("die", 0)
-    stage = _stage(tmp_path / "s")
+    stage = stage_in(tmp_path)
     with pytest.raises(EnvironmentMissing, match=r"1 of 5 items without a result.*fewer --workers"):
         run_items(stage, _items(*payloads), make_worker, (tmp_path / "log",), workers=2)
     assert sorted(r["id"] for r in stage.journal.read() if r["status"] == "kept") == ["i0", "i1", "i3", "i4"]
-    assert not _stage(tmp_path / "s").is_complete
+    assert not stage_in(tmp_path).is_complete
 
 
 def test_a_fatal_error_stops_and_keeps_what_was_done(tmp_path):
-    stage = _stage(tmp_path / "s")
+    stage = stage_in(tmp_path)
     items = _items(("keep", 1), ("keep", 2), *[("full", 0)] * 4)
     with pytest.raises(StorageError, match="disk full"):
         run_items(stage, items, make_worker, (tmp_path / "log",), workers=2)
@@ -130,7 +125,7 @@ def make_broken_worker(error: Exception):
 
 @pytest.mark.parametrize("error", [InputError("no such map", where="map.json"), KeyError("no such map")])
 def test_an_error_in_the_factory_is_the_stages_error(tmp_path, error):
-    arguments = _stage(tmp_path / "s"), _items(("keep", 1), ("keep", 2)), make_broken_worker, (error,)
+    arguments = stage_in(tmp_path), _items(("keep", 1), ("keep", 2)), make_broken_worker, (error,)
     with pytest.raises(type(error), match="no such map"):
         run_items(*arguments, workers=2)
 

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.formats.kinds import KINDS
-from cosfly.runtime.errors import ResumeError
 from cosfly.simplify.passes import SimplifyConfig, clusters, crop_below_ground, merge, prune_nested, simplify
 from cosfly.simplify.stage import cross_validate, run
 
@@ -248,10 +247,3 @@ def test_stage_writes_map_report_and_picture(tmp_path: Path):
     assert report["passes"][-1]["counts"] == simplified.counts()
     assert 0 < report["grid"]["iou"] <= 1
     assert (tmp_path / "out/simplify.png").read_bytes()[:4] == b"\x89PNG"
-
-    written = product.read_bytes()
-    assert run(SimplifyConfig(), source, tmp_path / "out") == product  # complete: nothing to do
-    run(SimplifyConfig(), source, tmp_path / "again")
-    assert (tmp_path / "again/step2_simplified.json").read_bytes() == written
-    with pytest.raises(ResumeError, match="trunk was 'stem', is 'full'"):
-        run(SimplifyConfig(trunk="full"), source, tmp_path / "out")

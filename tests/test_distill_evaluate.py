@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from specimens_distill import make_caption, write_set
+from specimens_families import make_tokenizer
 
 from cosfly.formats.captions import TOKENS, ValueCounts, write_captions
 from cosfly.formats.predictions import Prediction
@@ -282,9 +283,7 @@ def test_values_of_a_students_texts_come_from_the_captions_made_of_them(place, t
     texts = json.loads(sample_of(11).answer)
     checks = {"values": {"en": {"values_matched": 3, "values_contradicted": 1}}}
     kept = make_caption("Town01", "trajectory_1", "ORI", 11, en=texts, checks=checks)
-    other = make_caption(
-        "Town01", "trajectory_1", "ORI", 10, checks=checks
-    )  # `one` has answered this; not with this text
+    other = make_caption("Town01", "trajectory_1", "ORI", 10, checks=checks)
     # The student answered this window too, but not with this text.
     other.en = other.en.model_copy(update={"reasoning_trace": "Something else."})
     write_captions(tmp_path / "captions.jsonl", [kept, other])
@@ -297,22 +296,16 @@ def make_encoder(folder: Path) -> Path:
     """A tiny random RoBERTa with a byte-level tokenizer; its files hold no model_max_length, as some do."""
     torch = pytest.importorskip("torch", reason="needs the extra distill")
     pytest.importorskip("bert_score", reason="needs the extra distill")
-    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors, trainers
-    from transformers import PreTrainedTokenizerFast, RobertaConfig, RobertaModel
+    from tokenizers import processors
+    from transformers import RobertaConfig, RobertaModel
 
-    tokenizer = Tokenizer(models.BPE())
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)
-    tokenizer.decoder = decoders.ByteLevel()
-    special, letters = ["<s>", "<pad>", "</s>", "<unk>", "<mask>"], sorted(pre_tokenizers.ByteLevel.alphabet())
-    given: dict = {"special_tokens": special, "initial_alphabet": letters, "show_progress": False}
-    trainer = trainers.BpeTrainer(vocab_size=400, **given)
-    tokenizer.train_from_iterator([sample_of(frame).answer for frame in FRAMES], trainer)
-    tokenizer.post_processor = processors.RobertaProcessing(("</s>", 2), ("<s>", 0))
-    names = {"bos": "<s>", "eos": "</s>", "cls": "<s>", "sep": "</s>", "unk": "<unk>", "pad": "<pad>", "mask": "<mask>"}
-    own = {f"{name}_token": token for name, token in names.items()}
-    PreTrainedTokenizerFast(tokenizer_object=tokenizer, **own).save_pretrained(folder)
+    tokenizer = make_tokenizer(["<pad>", "<s>", "</s>", "<unk>", "<mask>"], "", "</s>")
+    names = {"bos": "<s>", "cls": "<s>", "sep": "</s>", "unk": "<unk>", "mask": "<mask>"}
+    tokenizer.add_special_tokens({f"{name}_token": token for name, token in names.items()})
+    tokenizer.backend_tokenizer.post_processor = processors.RobertaProcessing(("</s>", 2), ("<s>", 1))
+    tokenizer.save_pretrained(folder)
     sizes = {"hidden_size": 32, "num_hidden_layers": 3, "num_attention_heads": 4, "intermediate_size": 64}
-    vocabulary = {"vocab_size": tokenizer.get_vocab_size(), "max_position_embeddings": 514, "pad_token_id": 1}
+    vocabulary = {"vocab_size": len(tokenizer), "max_position_embeddings": 514, "pad_token_id": 0}
     config = RobertaConfig(**sizes, **vocabulary, initializer_range=0.3)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)

@@ -18,8 +18,8 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
-from specimens_captions import settings
-from teacher_server import CHINESE, ENGLISH, is_mirror, kept_answers
+from specimens_captions import deciding, settings
+from teacher_server import USAGE, is_mirror, kept_answers, obedient_answer
 
 from caption.schema import CaptionConfig
 from caption.stage import window_loop
@@ -38,6 +38,13 @@ from cosfly.runtime.journal import Journal
 from distill.inference import stage as infer
 from distill.schema import open_split
 
+OBEDIENT = deciding()
+
+
+def obedient(messages: list[dict], schema: dict) -> str:
+    body = {"messages": messages, "response_format": {"json_schema": {"schema": schema}}}
+    return json.dumps(obedient_answer(OBEDIENT, body))
+
 
 class PlainEngine:
     kind, where, model = "endpoint", "plain", ""
@@ -51,12 +58,7 @@ class PlainEngine:
     async def answer(self, request: Request) -> Reply:
         self.num_answers += 1
         await asyncio.sleep(0)
-        decision = request.schema["properties"]["flight_decision"]["enum"][0]
-        texts = CHINESE if is_mirror({"messages": request.messages}) else ENGLISH
-        decisions = {name: decision for name in request.schema["properties"] if name not in texts}
-        return Reply(
-            json.dumps({**texts, **decisions}), Usage(prompt_tokens=1000, completion_tokens=100), "json_schema", "stop"
-        )
+        return Reply(obedient(request.messages, request.schema), Usage(**USAGE), "json_schema", "stop")
 
     async def close(self) -> None:
         self.num_closed += 1
@@ -206,11 +208,7 @@ def stand_in(monkeypatch):
             Engine.asked.append(conversation)
             Engine.templates.append(chat_template_kwargs)
             schema = parameters.values["structured_outputs"].values["json"]
-            is_chinese = is_mirror({"messages": conversation}) or not str(conversation[0]["content"]).isascii()
-            answer = CHINESE if is_chinese else ENGLISH
-            decision = schema["properties"]["flight_decision"]["enum"][0]
-            decisions = {name: decision for name in schema["properties"] if name not in answer}
-            text, tokens = json.dumps({**answer, **decisions}), tuple(range(7))
+            text, tokens = obedient(conversation, schema), tuple(range(7))
             completion = SimpleNamespace(text=text, token_ids=tokens, finish_reason=Engine.finish_reason)
             found = SimpleNamespace(outputs=[completion], prompt_token_ids=[0] * 1280, request_id=name, finished=True)
             self.open.append(found)

@@ -32,7 +32,7 @@ from test_cosfly_inspection import plan_of
 from test_cosfly_map_kinds import city, node, write_world
 
 from caption.schema import CaptionConfig
-from caption.stage.ledger import page_html
+from caption.stage.ledger import REPORT_FORMAT, CaptionReport, page_html
 from caption.stage.stage import run as caption
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.captions import Caption, read_captions
@@ -45,6 +45,7 @@ from cosfly.formats.traces import write_traces
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import box_corners
 from cosfly.inspection.report import report_html
+from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run as inspect
 from cosfly.llm.answer_text import parse_answer
 from cosfly.llm.answers import BudgetConfig
@@ -54,7 +55,7 @@ from cosfly.runtime import console as shared
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError
 from cosfly.runtime.escaping import LONGEST, for_terminal
 from cosfly.runtime.io import CHECKSUMS, read_checksums
-from cosfly.runtime.json_io import read_json, write_json
+from cosfly.runtime.json_io import read_model, write_json
 from cosfly.runtime.run_dir import read_manifest
 from cosfly.runtime.tables import rows_of
 from cosfly.viz.scene_page import run
@@ -309,8 +310,6 @@ def forged(model: type[BaseModel], honest: BaseModel, least: int) -> BaseModel:
 
 @pytest.fixture(scope="module")
 def inspection(tree, tmp_path_factory) -> Path:
-    from cosfly.inspection.settings import InspectConfig
-
     return inspect(InspectConfig(jerk_rms_max_mps3=1e6), None, None, tree, tmp_path_factory.mktemp("inspected"))
 
 
@@ -334,10 +333,7 @@ def test_the_page_of_an_inspection_shows_forged_records(inspection):
 
 def test_the_page_of_a_captioning_run_shows_forged_captions(tree, tmp_path):
     done = caption(CaptionConfig(), tree, tmp_path / "caption").parent
-    from caption.stage.ledger import CaptionReport
-
-    value = read_json(done / "caption_report.json")
-    report = CaptionReport.model_validate({k: v for k, v in value.items() if k not in ("schema", "schema_version")})
+    report = read_model(done / "caption_report.json", CaptionReport, REPORT_FORMAT, tree=done)
     cards = [forged(Caption, card, 8) for card in list(read_captions(done / "captions.jsonl"))[:3]]
     page = page_html(forged(CaptionReport, report, 1), cards, {}, BudgetConfig(), HOSTILE)
     check_page(page, (done / "report.html").read_text(encoding="utf-8") + '<div class="gone"></div>')
@@ -346,19 +342,8 @@ def test_the_page_of_a_captioning_run_shows_forged_captions(tree, tmp_path):
 markdown = MarkdownIt("commonmark", {"html": True}).enable("table")
 
 
-def test_a_card_shows_forged_texts(tree, inspection, tmp_path):
-    from release.build.config import ReleaseConfig
-    from release.build.sources import Source
-    from release.build.stage import run
-
-    captions = caption(CaptionConfig(), tree, tmp_path / "caption")
-    folder = run(
-        ReleaseConfig(licence="mit", pairs="any"), [Source.of_files(tree, captions, inspection)], tmp_path / "release"
-    )
-    folder = folder if folder.is_dir() else folder.parent
-    value = read_json(folder / "release.json")
-    record = ReleaseRecord.model_validate({k: v for k, v in value.items() if k not in ("schema", "schema_version")})
-    card = render_card(forged(ReleaseRecord, record, 8))
+def test_a_card_shows_forged_texts(specimens):
+    card = render_card(forged(ReleaseRecord, read_record(specimens / "release/dataset/release.json"), 8))
     page = markdown.render(card.split("\n---\n", 1)[1])
     assert "alert(1)" in page
     assert not {"script", "img", "a"} & {tag for tag, *_ in Tags(page).seen}
