@@ -204,11 +204,11 @@ def test_a_town_has_what_the_passes_and_the_walks_need(seed):
     assert 20 < tops.max() <= 38
     assert (town.maxs[:, 2] < -0.5).any(), "something to crop below the ground"
     result = simplify(town, SimplifyConfig())
-    counts = [sum(c.values()) for _, c in result.passes]
+    counts = [sum(one.counts.values()) for one in result.header.passes]
     assert counts[1] < counts[0]  # merged
     assert counts[3] < counts[2]  # below the ground
     assert counts[4] < counts[3]  # nested
-    walkable = cross_validate(town, result.box_map)
+    walkable = cross_validate(town, result)
     assert walkable["simplified_largest_part_m2"] > 45_000
     assert walkable["simplified_largest_part_m2"] > 0.98 * walkable["simplified_walkable_m2"]
 
@@ -222,9 +222,9 @@ def test_the_census_town_has_the_papers_counts_and_simplifies_to_a_few_thousand(
     low, high = town.bounds()
     np.testing.assert_allclose(high[:2] - low[:2], (619, 506))
     result = simplify(town, SimplifyConfig())
-    assert 2000 < len(result.box_map) < 4000
-    assert result.box_map.counts()["Vegetation"] < 1000
-    assert cross_validate(town, result.box_map)["iou"] > 0.92  # the paper's figure
+    assert 2000 < len(result) < 4000
+    assert result.counts()["Vegetation"] < 1000
+    assert cross_validate(town, result)["iou"] > 0.92  # the paper's figure
 
 
 @each(
