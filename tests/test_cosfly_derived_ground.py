@@ -70,7 +70,7 @@ def test_people_of_a_foreign_city_of_buildings_alone_walk_on_its_pavements(share
     box_map = load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=path, solids=False)))
     assert box_map.header.derived_ground < 2.0 * box_map.counts()["Buildings"]
     cfg = PedestriansConfig(road_cost=20)
-    ground = walkable_ground(simplify(box_map, SimplifyConfig()).box_map, cfg)
+    ground = walkable_ground(simplify(box_map, SimplifyConfig()), cfg)
     walks = [make_pedestrian("p", ground, cfg, rng_for(0, "pedestrians", str(k))).trajectory for k in range(20)]
     places = np.concatenate([walk.positions_m for walk in walks])
     x, y = ground.grid.cells_at(places).T

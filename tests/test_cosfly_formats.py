@@ -47,6 +47,27 @@ def test_boxes_round_trip(tmp_path_factory, n, seed):
     assert path.read_bytes() == first  # idempotent
 
 
+@each(
+    ("change", "words"),
+    [
+        (lambda value: value.update(axes="y up"), r"axes: .*got y up; expected right-handed"),
+        (lambda value: value.update(num_boxes=9), r"num_boxes: .*got 9; expected 4"),
+        (lambda value: value["boxes"][2].update(semantic_id=99), r"box 3: semantic_id: .*got 99"),
+        (lambda value: value["boxes"][1]["max"].__setitem__(0, 1e4), r"box 2: max: .*half the size in metres"),
+        (lambda value: value["boxes"][1]["extent"].__setitem__(0, -1.0), r"box 2: extent: .*numbers from 0 to"),
+        (lambda value: value["boxes"][1]["center"].__setitem__(0, 1e9), r"box 2: center: .*to 10,000,000"),
+        (lambda value: value.pop("boxes"), r"boxes: .*missing"),
+        (lambda value: value.update(boxes={}), r"boxes: .*list"),
+        (lambda value: value.update(boxes=[]), "has no boxes"),
+    ],
+)
+def test_fields_of_a_map_that_contradict_each_other_are_named(tmp_path, change, words):
+    write_boxes(tmp_path / "boxes_3d.json", some_boxes(4, 0))
+    change_json(tmp_path / "boxes_3d.json", change)
+    with pytest.raises(InputError, match=words):
+        read_boxes(tmp_path / "boxes_3d.json")
+
+
 def test_roi_forms(tmp_path):
     path = tmp_path / "roi_polygon.json"
     square = [[0, 0], [10, 0], [10, 10]]

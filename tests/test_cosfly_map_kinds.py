@@ -204,11 +204,11 @@ def test_a_town_has_what_the_passes_and_the_walks_need(seed):
     assert 20 < tops.max() <= 38
     assert (town.maxs[:, 2] < -0.5).any(), "something to crop below the ground"
     result = simplify(town, SimplifyConfig())
-    counts = [sum(c.values()) for _, c in result.passes]
+    counts = [sum(one.counts.values()) for one in result.header.passes]
     assert counts[1] < counts[0]  # merged
     assert counts[3] < counts[2]  # below the ground
     assert counts[4] < counts[3]  # nested
-    walkable = cross_validate(town, result.box_map)
+    walkable = cross_validate(town, result)
     assert walkable["simplified_largest_part_m2"] > 45_000
     assert walkable["simplified_largest_part_m2"] > 0.98 * walkable["simplified_walkable_m2"]
 
@@ -222,9 +222,9 @@ def test_the_census_town_has_the_papers_counts_and_simplifies_to_a_few_thousand(
     low, high = town.bounds()
     np.testing.assert_allclose(high[:2] - low[:2], (619, 506))
     result = simplify(town, SimplifyConfig())
-    assert 2000 < len(result.box_map) < 4000
-    assert result.box_map.counts()["Vegetation"] < 1000
-    assert cross_validate(town, result.box_map)["iou"] > 0.92  # the paper's figure
+    assert 2000 < len(result) < 4000
+    assert result.counts()["Vegetation"] < 1000
+    assert cross_validate(town, result)["iou"] > 0.92  # the paper's figure
 
 
 @pytest.mark.parametrize(
@@ -274,15 +274,19 @@ def test_a_building_on_the_road_leaves_a_carriageway(tmp_path: Path):
         simworld(write_world(tmp_path, node("BP_Building_01_C", 0, 0, z=1e300)))
 
 
-def test_an_asset_without_a_size_is_an_error_or_counted(tmp_path: Path):
+def test_an_asset_without_a_size_is_counted_and_many_are_an_error(tmp_path: Path, caplog):
     cfg = write_world(tmp_path, node("BP_Building_01_C", 0, 0), node("BP_Building_99_C", 9000, 0))
-    with pytest.raises(InputError, match=r"the size of the asset is unknown.*BP_Building_99_C.*unknown=drop"):
+    with pytest.raises(
+        InputError, match=r"GEN_BP_Building_99_C: the asset BP_Building_99_C has no size.*simworld.sizes"
+    ):
         simworld(cfg)
-    cfg = cfg.model_copy(update={"unknown": "drop"})
+    places = ((4000 * k, 0) for k in range(4))
+    cfg = write_world(tmp_path, *(node("BP_Building_01_C", *xy) for xy in places), node("BP_Building_99_C", 0, 9000))
     assert simworld(cfg).header.dropped_objects == {"unknown_asset": 1}
+    assert "the asset BP_Building_99_C has no size" in caplog.text
     run(MapsConfig(source="simworld", simworld=cfg), tmp_path / "out")
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
-    assert manifest["counts"] == {"input": 2, "kept": 1, "dropped": {"unknown_asset": 1}, "failed": {}}
+    assert manifest["counts"] == {"input": 5, "kept": 4, "dropped": {"unknown_asset": 1}, "failed": {}}
 
 
 def overlapping_pairs(buildings: BoxMap, *, with_yaw: bool) -> int:

@@ -290,7 +290,7 @@ def test_a_solid_is_drawn_as_its_finest_surfaces_and_kept_out_of_as_boxes(tmp_pa
     plain = cityjson.load(CityJsonConfig(path=tmp_path / "city.json", solids=False))
     assert not plain.meshes.refs
     assert len(plain) == len(box_map)
-    assert not simplify(box_map, SimplifyConfig()).box_map.meshes.refs
+    assert not simplify(box_map, SimplifyConfig()).meshes.refs
 
 
 def scene_map(folder: Path) -> BoxMap:

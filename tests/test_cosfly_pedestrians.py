@@ -197,7 +197,7 @@ def test_simworld_gives_twenty_of_twenty(shared_data, tmp_path):
 
     folder = shared_data / "simworld-progen"
     city = load(SimWorldConfig(world=folder / "progen_world.json", sizes=[folder / "Bbox.json"]))
-    write_boxes(tmp_path / "map.json", simplify(city, SimplifyConfig()).box_map)
+    write_boxes(tmp_path / "map.json", simplify(city, SimplifyConfig()))
     product = run(PedestriansConfig(), tmp_path / "map.json", tmp_path / "out")
     assert len(read_paths(product)) == 20
     ground = json.loads((tmp_path / "out" / "pedestrians_report.json").read_text())["ground"]
@@ -355,7 +355,7 @@ def shares(cfg: RunConfig, name: str) -> tuple[float, float]:
     """Shares of the walked points of a town, on carriageway away from crossings and on crossings."""
     town = cfg.of_town(name)
     walking = town.pedestrians
-    ground = walkable_ground(simplify(load_map(town.maps, seed=town.seed), town.simplify).box_map, walking)
+    ground = walkable_ground(simplify(load_map(town.maps, seed=town.seed), town.simplify), walking)
     counts = np.zeros(3)
     for k in range(walking.num_paths):
         rng = rng_for(town.seed, "pedestrians", f"path_{k:05d}")

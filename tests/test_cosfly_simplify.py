@@ -56,7 +56,7 @@ def test_merge_follows_the_gap_rule(kind, gap, count):
     shift = np.where(np.array(gap) == 0, 0.0, 1.0 + np.array(gap))
     kinds = kind.split()
     pair = box_map((kinds[0], (0, 0, 0), (1, 1, 1)), (kinds[-1], shift, shift + 1))
-    merged = simplify(pair, only("merge", min_fill=0.0, min_canopy_fill=0.0)).box_map
+    merged = simplify(pair, only("merge", min_fill=0.0, min_canopy_fill=0.0))
     assert len(merged) == count
     if count == 1:
         assert merged.ids.tolist() == [1]
@@ -103,8 +103,8 @@ def test_the_guard_keeps_a_street_between_two_askew_rows_and_the_papers_rule_doe
             x, y = along * np.cos(turn) - side * np.sin(turn), along * np.sin(turn) + side * np.cos(turn)
             rows.append(("Buildings", (x - 5, y - 2.5, 0), (x + 5, y + 2.5, 8), 40.0))
     street = box_map(*rows)
-    plain = simplify(street, only("merge", min_fill=0.0, min_canopy_fill=0.0)).box_map
-    guarded = simplify(street, only("merge")).box_map
+    plain = simplify(street, only("merge", min_fill=0.0, min_canopy_fill=0.0))
+    guarded = simplify(street, only("merge"))
     assert len(plain) == 1
     assert len(guarded) > 1
     walkable = [cross_validate(street, m)["simplified_walkable_m2"] for m in (plain, guarded)]
@@ -114,7 +114,7 @@ def test_the_guard_keeps_a_street_between_two_askew_rows_and_the_papers_rule_doe
 
 def test_full_trunks_are_the_papers_split():
     tree = box_map(("Vegetation", (0, 0, 0), (4, 6, 10)), ids=[77])
-    cropped = simplify(tree, only("crop_tree", trunk="full")).box_map
+    cropped = simplify(tree, only("crop_tree", trunk="full"))
     assert cropped.ids.tolist() == [77, 1]
     np.testing.assert_allclose(cropped.mins, [(0, 0, 2.5), (0, 0, 0)])
     np.testing.assert_allclose(cropped.maxs, [(4, 6, 10.5), (4, 6, 2)])
@@ -122,10 +122,10 @@ def test_full_trunks_are_the_papers_split():
 
 def test_stems_let_people_walk_below_trees():
     tree = box_map(("Vegetation", (0, 0, 0), (4, 6, 10)), ("Roads", (-9, -9, -1), (9, 9, 0)))
-    stems = simplify(tree, only("crop_tree")).box_map
+    stems = simplify(tree, only("crop_tree"))
     np.testing.assert_allclose(stems.maxs[2] - stems.mins[2], (0.5, 0.5, 2.0))
     np.testing.assert_allclose(stems.centers[2], (2, 3, 1))
-    full = simplify(tree, only("crop_tree", trunk="full")).box_map
+    full = simplify(tree, only("crop_tree", trunk="full"))
     area = [cross_validate(tree, m)["simplified_walkable_m2"] for m in (stems, full)]
     assert area[0] > area[1] + 20.0
 
@@ -138,11 +138,11 @@ def test_adaptive_cropping_cuts_tall_trees_into_a_stem_and_low_pieces():
         ("Buildings", (30, 0, 0), (40, 9, 30)),
         ids=[7, 8, 9, 1],
     )
-    result = simplify(plants, only("crop_tree", crop_strategy="adaptive")).box_map
+    result = simplify(plants, only("crop_tree", crop_strategy="adaptive"))
     assert result.ids.tolist() == [8, 1, 2, 7, 3, 4, 9]
     np.testing.assert_allclose(result.mins[2:], [(1.75, 2.75, 0), (0, 0, 5), (0, 0, 9), (20, 0, 3), (20, 0, 5)])
     np.testing.assert_allclose(result.maxs[2:], [(2.25, 3.25, 5), (4, 6, 9), (4, 6, 13), (24, 4, 5), (24, 4, 9)])
-    again = simplify(result, only("crop_tree", crop_strategy="adaptive")).box_map
+    again = simplify(result, only("crop_tree", crop_strategy="adaptive"))
     assert sorted(again.ids.tolist()) == sorted(result.ids.tolist())
 
 
@@ -153,8 +153,14 @@ def test_the_simworld_variants_work_together():
         nested_tolerance_m=1e-6,
     )  # fmt: skip
     result = simplify(boxes, cfg)
-    assert [name for name, _ in result.passes] == ["input", "merge", "crop_tree", "crop_below_ground", "prune_nested"]
-    solid = result.box_map.select(result.box_map.kinds != ROADS)
+    assert [one.name for one in result.header.passes] == [
+        "input",
+        "merge",
+        "crop_tree",
+        "crop_below_ground",
+        "prune_nested",
+    ]
+    solid = result.select(result.kinds != ROADS)
     assert solid.mins[:, 2].min() >= -1e-9
 
 
@@ -224,13 +230,19 @@ def test_pruning_equals_the_slow_rule_on_unturned_boxes(seed, count):
 def test_the_whole_keeps_its_books(seed, paper):
     boxes = random_map(seed, 80)
     result = simplify(boxes, SimplifyConfig(**(PAPER if paper else {})))
-    ids = result.box_map.ids.tolist()
+    ids = result.ids.tolist()
     assert len(set(ids)) == len(ids)
-    assert [name for name, _ in result.passes] == ["input", "merge", "crop_tree", "crop_below_ground", "prune_nested"]
-    assert result.passes[0][1] == boxes.counts()
-    assert result.passes[-1][1] == result.box_map.counts()
-    after_crop, after_ground = (sum(counts.values()) for _, counts in result.passes[2:4])
-    assert sum(result.passes[1][1].values()) <= len(boxes)
+    assert [one.name for one in result.header.passes] == [
+        "input",
+        "merge",
+        "crop_tree",
+        "crop_below_ground",
+        "prune_nested",
+    ]
+    assert result.header.passes[0].counts == boxes.counts()
+    assert result.header.passes[-1].counts == result.counts()
+    after_crop, after_ground = (sum(one.counts.values()) for one in result.header.passes[2:4])
+    assert sum(result.header.passes[1].counts.values()) <= len(boxes)
     assert after_ground <= after_crop
 
 

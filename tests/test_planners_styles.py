@@ -146,7 +146,7 @@ ORDERS, DECISIONS_LEAST, STYLE_MOST = {"break_off", "return_to_home"}, 0.02, 0.3
 def flights_of(cfg):
     for name in cfg.towns:
         town = cfg.of_town(name)
-        box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify).box_map
+        box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify)
         ground, paces = walkable_ground(box_map, town.pedestrians), paces_of(10, town.pedestrians.pace, town.seed)
         chances = {walk_id(k): rng_for(town.seed, "pedestrians", walk_id(k)) for k in range(len(paces))}
         walks = [

@@ -143,7 +143,7 @@ class BenchmarkWorld:
 def world_of(town: BenchmarkTown) -> BenchmarkWorld:
     """Build a town, once per process."""
     boxes = load(SyntheticConfig(name=town.name, preset=town.preset), town.seed)
-    simplified = simplify(boxes, SimplifyConfig()).box_map
+    simplified = simplify(boxes, SimplifyConfig())
     return BenchmarkWorld(
         town=town,
         boxes=boxes,

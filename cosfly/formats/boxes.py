@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +15,7 @@ from cosfly.formats.columns import FARTHEST_M, LARGEST, rounded
 from cosfly.formats.kinds import GROUND_KINDS, KIND_COLORS, KIND_NAMES, KINDS
 from cosfly.formats.meshes import Meshes, MeshRef
 from cosfly.geometry.axes import axis_aligned_half_extents
-from cosfly.runtime.errors import InputError, json_type, nearest
+from cosfly.runtime.errors import InputError, nearest
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import MISSING, FileFormat, check_schema, dump_json, read_json, validated
 
@@ -25,8 +25,8 @@ AXES = "right-handed, metres, x east, y north, z up; degrees"
 # Largest distance between a corner in a file and the computed one, per axis: an absolute part, because exporters round
 # and rotate in single precision, and a part relative to the coordinate.
 CORNER_M, CORNER_SHARE = 0.05, 1e-6
-# Fields of a file that are computed from the boxes; a header does not keep them.
-COMPUTED = {"schema", "schema_version", "axes", "bounds", "num_boxes", "counts"}
+# Fields of a file that a header does not keep: the boxes, and what is computed from them.
+COMPUTED = {"schema", "schema_version", "axes", "bounds", "num_boxes", "counts", "boxes"}
 UNIT_FIELDS = {"unit", "units", "crs", "epsg", "srs", "coordinate_system", "up_axis", "up"}  # of other tools
 VECTORS = ("centers", "half_extents", "rotations_deg")  # fields of a BoxMap, (n, 3)
 ARRAYS = (*VECTORS, "kinds", "ids")  # fields of a BoxMap with one row per box
@@ -162,21 +162,18 @@ def make_box_map(
 def check_boxes(box_map: BoxMap, where: str | Path) -> None:
     """Check that numbers are finite, extents not negative, kinds known and ids unique."""
 
-    def check(name: str, rows: np.ndarray, is_valid: np.ndarray, what: str, expected: str) -> None:
-        bad = _first_row(~is_valid)
-        if bad is not None:
-            got = str(rows[bad].tolist())
-            raise InputError(what, where=f"{where}: box {box_map.ids[bad]}: {name}", got=got, expected=expected)
-
-    for name, rows in (
-        ("center", box_map.centers),
-        ("extent", box_map.half_extents),
-        ("rotation", box_map.rotations_deg),
+    for name, least, rows in (
+        ("center", -FARTHEST_M, box_map.centers),
+        ("extent", 0.0, box_map.half_extents),
+        ("rotation", -FARTHEST_M, box_map.rotations_deg),
     ):
-        what, expected = "the box has a number that is not finite or too large", f"numbers up to {FARTHEST_M:,.0f}"
-        check(name, rows, np.abs(rows) <= FARTHEST_M, what, expected)  # NaN fails
-    half = box_map.half_extents
-    check("extent", half, half >= 0, "the box has a negative extent", "half sizes of at least 0 m")
+        for row in np.flatnonzero(~((rows >= least) & (rows <= FARTHEST_M)).all(axis=1)).tolist():  # NaN too
+            raise InputError(
+                "the box has a number that is not finite, too large or negative",
+                where=f"{where}: box {box_map.ids[row]}: {name}",
+                got=str(rows[row].tolist()),
+                expected=f"numbers from {least:,.0f} to {FARTHEST_M:,.0f}",
+            )
     unknown = [int(kind) for kind in np.unique(box_map.kinds) if int(kind) not in KIND_NAMES]
     if unknown:
         expected = f"an id from {min(KIND_NAMES)} to {max(KIND_NAMES)}"
@@ -185,12 +182,6 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
     if (counts > 1).any():
         got = str(ids[counts > 1][0])
         raise InputError("two boxes have the same id", where=where, got=got, expected="a different id for each box")
-
-
-def _first_row(mask: np.ndarray) -> int | None:
-    """Return the first row of a mask (n, 3) that holds True; None if there is none."""
-    rows = np.flatnonzero(mask.any(axis=1))
-    return int(rows[0]) if len(rows) else None
 
 
 def check_ground(box_map: BoxMap, path: Path) -> None:
@@ -281,9 +272,10 @@ def read_boxes(path: Path) -> BoxMap:
         raise InputError("this file is a table of boxes, not a map", where=path, fix=fix)
     value = read_json(path, what=BOXES_FORMAT.what, most_mb=MAP_MB)
     header = MapHeader(name=path.stem)
-    records: Any = value
-    if not isinstance(value, list):
-        records = check_schema(value, BOXES_FORMAT, path).pop("boxes", None)
+    if isinstance(value, list):
+        value = {"boxes": value}
+    else:
+        check_schema(value, BOXES_FORMAT, path)
         for name in UNIT_FIELDS & value.keys():
             if str(value[name]).lower() not in ("m", "metre", "metres", "meter", "meters", "none"):
                 raise InputError(
@@ -294,18 +286,11 @@ def read_boxes(path: Path) -> BoxMap:
                     fix="convert the boxes to metres, z up, and remove this field",
                 )
         header = validated(MapHeader, {key: field for key, field in value.items() if key not in COMPUTED}, path)
-        if records is None:
-            raise InputError(MISSING, where=f"{path}: boxes", expected="a list of boxes")
-        if not isinstance(records, list):
-            raise InputError(
-                "the field is not a list of boxes",
-                where=f"{path}: boxes",
-                got=json_type(records),
-                expected="a list of boxes",
-            )
-    if not records:
+    if "boxes" not in value:
+        raise InputError(MISSING, where=f"{path}: boxes", expected="a list of boxes")
+    boxes = validated(_Boxes, value, path).boxes
+    if not boxes:
         raise InputError("the map has no boxes", where=path, fix="export or make this map again")
-    boxes = validated(_Boxes, {"boxes": records}, path).boxes
     box_map = make_box_map(
         [box.center for box in boxes],
         [box.extent for box in boxes],
@@ -317,38 +302,29 @@ def read_boxes(path: Path) -> BoxMap:
     refs = {box.id: box.mesh for box in boxes if box.mesh is not None}
     box_map = replace(box_map, meshes=Meshes(refs, path.parent))
     check_boxes(box_map, path)
-    _check_computed(value if isinstance(value, dict) else {}, boxes, box_map, path)
+    for where, got, expected in _mismatches(value, boxes, box_map):
+        raise InputError(
+            "the field does not match the other fields of the file",
+            where=f"{path}: {where}",
+            got=str(got)[:200],
+            expected=str(expected)[:200],
+            fix="write extent as half the size in metres, and rotation as pitch, yaw and roll in degrees; or correct "
+            "this field, which is computed from the others",
+        )
     return box_map
 
 
-def _check_computed(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, path: Path) -> None:
-    """Check the redundant fields of a file against its boxes, which finds a file with other axes or units."""
-    computed = {"axes": AXES, "num_boxes": len(box_map), "counts": box_map.counts()}
-    for name, value in computed.items():
-        if header.get(name, value) != value:
-            got, expected = dump_json(header[name])[:200], dump_json(value)[:200]
-            what, fix = "the field does not match the boxes of the file", "correct this field, or export the map again"
-            raise InputError(what, where=f"{path}: {name}", got=got, expected=expected, fix=fix)
+def _mismatches(value: dict[str, Any], boxes: list[_Box], box_map: BoxMap) -> Iterator[tuple[str, Any, Any]]:
+    """Yield where redundant fields differ from the boxes, as in a file with other axes or units: found and expected."""
+    for name, computed in {"axes": AXES, "num_boxes": len(box_map), "counts": box_map.counts()}.items():
+        if value.get(name, computed) != computed:
+            yield name, value[name], computed
     for box in boxes:
-        number = KINDS[box.type]
-        if box.semantic_id not in (None, number):
-            raise InputError(
-                "semantic_id does not match the type of the box",
-                where=f"{path}: box {box.id}: semantic_id",
-                got=box.semantic_id,
-                expected=f"{number} for {box.type}",
-                fix="correct semantic_id or type",
-            )
+        if box.semantic_id not in (None, KINDS[box.type]):
+            yield f"box {box.id}: semantic_id", box.semantic_id, KINDS[box.type]
     for name, corners in (("min", box_map.mins), ("max", box_map.maxs)):
         # A corner that the file does not hold is NaN, which compares as equal here.
         file_corners = np.array([getattr(box, name) or [np.nan] * 3 for box in boxes])
         differs = np.abs(file_corners - corners) > CORNER_M + CORNER_SHARE * np.abs(corners)
-        bad = _first_row(differs)
-        if bad is not None:
-            raise InputError(
-                "the corner does not match center, extent and rotation of the box",
-                where=f"{path}: box {boxes[bad].id}: {name}",
-                got=str(file_corners[bad].tolist()),
-                expected=str(rounded(corners[bad])),
-                fix="write extent as half the size in metres, and rotation as pitch, yaw and roll in degrees",
-            )
+        for row in np.flatnonzero(differs.any(axis=1)).tolist():
+            yield f"box {boxes[row].id}: {name}", file_corners[row].tolist(), rounded(corners[row])

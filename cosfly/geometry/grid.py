@@ -203,14 +203,6 @@ def _fill_hull(points, count, touch, mark, cells):  # pragma: no cover (compiled
                 cells[row, column] = mark
 
 
-def compare(left: OccupancyGrid, right: OccupancyGrid) -> tuple[float, float]:
-    """Return the share of equal cells of two grids of one frame, and the IoU of their occupied cells, 1 without any."""
-    union = int(np.count_nonzero(left.occupied | right.occupied))
-    intersection = int(np.count_nonzero(left.occupied & right.occupied))
-    agreement = 1.0 - (union - intersection) / left.occupied.size
-    return agreement, intersection / union if union else 1.0
-
-
 # --- cells to walkable ground -----------------------------------------------------------------------------------------
 
 

@@ -9,6 +9,7 @@ import logging
 import math
 from collections.abc import Callable
 from fnmatch import fnmatchcase
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -21,7 +22,7 @@ from cosfly.maps.units import METRES, Units, declared_units, length_m, refused
 from cosfly.runtime.config import read_yaml
 from cosfly.runtime.errors import InputError, counts_text, json_type, shown
 from cosfly.runtime.io import over_limit, read_unpacked
-from cosfly.runtime.json_io import parse_document, parse_json, validated
+from cosfly.runtime.json_io import parse_document, validated
 
 log = logging.getLogger(__name__)
 
@@ -34,10 +35,8 @@ VALIDATE = "check the file with `cjio FILE validate`"
 # Rings are indices of vertices; of a solid's shells only the outer one counts.
 _Ring = Annotated[list[Annotated[int, Field(strict=True, ge=0)]], Field(min_length=3)]
 _Surface = Annotated[list[_Ring], Field(min_length=1)]
-BOUNDARIES: dict[str, Any] = {
-    "MultiSurface": list[_Surface], "CompositeSurface": list[_Surface], "Solid": list[list[_Surface]],
-    "MultiSolid": list[list[list[_Surface]]], "CompositeSolid": list[list[list[_Surface]]],
-}  # fmt: skip
+_Shells = list[list[_Surface]]
+GEOMETRIES = ("MultiSurface", "CompositeSurface", "Solid", "MultiSolid", "CompositeSolid")
 Form = Literal["solid", "wall", "surface", "green"]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Surface = list[np.ndarray]  # rings of (n, 3) m: the outline, then the holes
@@ -187,7 +186,7 @@ def _read_parts(path: Path) -> tuple[str, _Document, list[tuple[str, _Part]]]:
     data = read_unpacked(path, what="city model", most_mb=CITY_MB)
     lines = data.replace(RECORD_SEPARATOR, b"").splitlines()
     texts = [(str(path), data)]
-    if len(lines) > 1 and b'"CityJSONFeature"' in data and _is_json(lines[0]):
+    if len(lines) > 1 and b'"CityJSONFeature"' in data and lines[0].rstrip().endswith(b"}"):  # not of one document
         texts = [(f"{path}: line {k + 1}", line) for k, line in enumerate(lines) if line.strip()]
     version = ""
     parts = list[tuple[str, Any]]()
@@ -217,15 +216,6 @@ def _read_parts(path: Path) -> tuple[str, _Document, list[tuple[str, _Part]]]:
     return version, parts[0][1], parts[1:]
 
 
-def _is_json(line: bytes) -> bool:
-    """Return whether a line is JSON by itself; the first line of a document of several lines is not."""
-    try:
-        parse_json(line)
-    except ValueError:
-        return False
-    return True
-
-
 def _vectors(values: list[Any], where: str) -> np.ndarray:
     """Return lists of three numbers as (n, 3)."""
     vectors = numbers(values, None, 3) if values else np.empty((0, 3))
@@ -243,7 +233,7 @@ def _city_object(object_id: str, item: _Object, part: _Part, vertices: np.ndarra
         log.warning("%s: dropped, because cosfly has no rule for the type %s", object_id, item.type)
         raise _Dropped("unmapped_type")
     geometries = item.geometry or []
-    usable = [k for k, geometry in enumerate(geometries) if geometry.type in BOUNDARIES]
+    usable = [k for k, geometry in enumerate(geometries) if geometry.type in GEOMETRIES]
     if not usable:
         raise _Dropped("no_geometry")
 
@@ -297,20 +287,17 @@ def _raised(surfaces: list[Surface], height_m: float) -> list[Surface]:
 
 def _surfaces(geometry: _Geometry, vertices: np.ndarray, where: str) -> list[Surface]:
     """Return the surfaces of a geometry; for a solid those of its outer shell."""
-    boundaries = geometry.boundaries
-    if geometry.type == "Solid":
-        boundaries = boundaries[:1]
-    elif geometry.type.endswith("Solid"):
-        boundaries = [shells[:1] if isinstance(shells, list) else shells for shells in boundaries]
+    shells = geometry.boundaries  # of a solid
+    if geometry.type.endswith("Surface"):
+        shells = [geometry.boundaries]
+    elif geometry.type != "Solid":
+        shells = [shell for solid in shells for shell in (solid[:1] if isinstance(solid, list) else [solid])]
     try:
-        boundaries = validated(BOUNDARIES[geometry.type], boundaries, where)
+        outer = validated(_Shells, shells[:1] if geometry.type == "Solid" else shells, where)
     except InputError as error:
         expected = "nested lists of rings of at least three indices of vertices"
         raise InputError(error.what, where=error.where, got=error.got, expected=expected, fix=VALIDATE) from error
-    if geometry.type.endswith("Solid"):
-        solids = [boundaries] if geometry.type == "Solid" else boundaries
-        boundaries = [surface for solid in solids for shell in solid for surface in shell]
-    return [_rings(surface, vertices, f"{where} surface {k}") for k, surface in enumerate(boundaries)]
+    return [_rings(surface, vertices, f"{where} surface {k}") for k, surface in enumerate(chain(*outer))]
 
 
 def _rings(surface: _Surface, vertices: np.ndarray, where: str) -> Surface:

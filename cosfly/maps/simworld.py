@@ -7,9 +7,8 @@ own surfaces, such as those of `cosfly world`, gets none added. `header.extent_s
 """
 
 import logging
-from collections import Counter
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import shapely
@@ -18,7 +17,17 @@ from pydantic import AliasPath, BaseModel, Field, FiniteFloat, field_validator
 from cosfly.formats.boxes import BoxMap, MapHeader, MapSource
 from cosfly.formats.columns import LARGEST
 from cosfly.formats.kinds import KINDS
-from cosfly.maps.boxlist import BASE_TOP_M, PAINT_TOP_M, ROAD_TOP_M, SLAB_M, BoxList, MapLicence, MapName, required
+from cosfly.maps.boxlist import (
+    BASE_TOP_M,
+    PAINT_TOP_M,
+    ROAD_TOP_M,
+    SLAB_M,
+    BoxList,
+    MapLicence,
+    MapName,
+    SkippedEntries,
+    required,
+)
 from cosfly.maps.footprints import footprints
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
@@ -54,9 +63,8 @@ class SimWorldConfig(Config):
     )
     licence: MapLicence = "apache-2.0"
     credits: str = Field("SimWorld, maitrix-org and contributors", description="attribution of the world's makers")
-    unknown: Literal["error", "drop"] = Field(
-        "error", description="assets without a kind or a size: fail, or drop them"
-    )
+    # largest share of objects whose assets have no kind or no size: they are dropped
+    most_skipped: ClassVar[float] = 0.2
 
     @field_validator("sizes", mode="before")
     @classmethod
@@ -144,7 +152,7 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
     stand_m = 0.0 if has_surfaces else STAND_M
     boxes = BoxList()
     sources = {"road": 0, "bbox": 0, "engine": 0, "default": 0}
-    dropped = Counter[str]()
+    dropped = SkippedEntries()
     road_nodes: list[_Node] = []
     for node in nodes:
         asset = asset_of(node.instance_name)
@@ -155,12 +163,14 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
             continue
         size = sizes.get(node.instance_name)
         if asset is None or size is None:
-            _check_unknown(cfg, node, "kind" if asset is None else "size")
-            dropped["unknown_asset"] += 1
+            problem = f"the asset {node.instance_name} has no {'kind' if asset is None else 'size'}"
+            dropped.add("unknown_asset", node.id, problem)
             continue
         sources[_add_node(boxes, node, asset, size, stand_m, world)] += 1
     if has_surfaces and road_nodes:  # the world has its roads as surfaces
-        dropped["road_piece"] = len(road_nodes)
+        dropped.counts["road_piece"] = len(road_nodes)
+    expected = "assets in a table of maps.simworld.sizes and in cosfly/simulators/assets.yaml, but for a fifth of them"
+    dropped.check(world, len(nodes), cfg.most_skipped, expected)
     widths: dict[str, float] = {}
     num_asset_boxes = len(boxes)
     if not has_surfaces:
@@ -173,7 +183,7 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
         name=cfg.name, source=MapSource(tool=tool, version="world file", file=world.name), licence=cfg.licence,
         credits=cfg.credits, ground_z_m=0.0, extent_sources=sources, roads=widths,
         added_boxes=len(boxes) - num_asset_boxes, num_objects=len(nodes),
-        dropped_objects=dict(dropped),
+        dropped_objects=dict(dropped.counts),
     )  # fmt: skip
     return boxes.box_map(header)
 
@@ -186,20 +196,6 @@ def read_sizes(paths: list[Path]) -> dict[str, np.ndarray]:
             for name, asset in group.items():
                 sizes.setdefault(name, asset.bbox.array())
     return sizes
-
-
-def _check_unknown(cfg: SimWorldConfig, node: _Node, what: str) -> None:
-    """Report an asset that cannot be placed, as an error or in the log."""
-    if cfg.unknown == "error":
-        fix = "add a table with its size to maps.simworld.sizes"
-        if what == "kind":
-            fix = "add the asset to cosfly/simulators/assets.yaml"
-        raise InputError(
-            f"the {what} of the asset is unknown", where=f"{cfg.world}: {node.id}.instance_name",
-            got=node.instance_name,
-            fix=f"{fix}, or drop such assets with --set maps.simworld.unknown=drop",
-        )  # fmt: skip
-    log.warning("%s: the asset %s has no %s, so the object is dropped", node.id, node.instance_name, what)
 
 
 def _add_node(boxes: BoxList, node: _Node, asset: Asset, size_cm: np.ndarray, stand_m: float, world: Path) -> str:

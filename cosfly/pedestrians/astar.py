@@ -7,6 +7,7 @@ steps: the result is the true optimum, not the optimum up to rounding, and ties 
 """
 
 import math
+from heapq import heappop, heappush
 
 import numpy as np
 
@@ -21,7 +22,6 @@ _STEP_Y = np.array([0, 1, 0, -1, 1, 1, -1, -1], dtype=np.int64)
 UNIFORM = np.ones(1, dtype=np.int64)
 
 _UNSEEN, _OPEN, _CLOSED = 0, 1, 2
-TOTAL, TO_GO, CELL = range(3)  # columns of the heap
 STRAIGHT, DIAGONAL = range(2)  # columns of the steps
 
 
@@ -70,16 +70,12 @@ def _search(free, origin, target, state, steps, from_direction, classes, costs, 
     """
     num_y, num_x = free.shape
     target_x, target_y = target % num_x, target // num_x
-    heap = np.empty((1024, 3), dtype=np.float64)  # estimated total, then cost to go: depth first in a tie; the cell
-    size = int64(0)
-
+    heap = [(0.0, 0.0, int64(origin))]  # estimated total, then cost to go: depth first in a tie; the cell
     state[origin] = _OPEN
     steps[origin, STRAIGHT] = steps[origin, DIAGONAL] = 0
     from_direction[origin] = -1
-    heap, size = _push(heap, size, 0.0, 0.0, origin)
-    while size > 0:
-        cell = int64(heap[0, CELL])
-        size = _pop(heap, size)
+    while heap:
+        cell = heappop(heap)[2]
         if state[cell] == _CLOSED:
             continue  # an outdated entry of a cell that was improved
         state[cell] = _CLOSED
@@ -110,55 +106,5 @@ def _search(free, origin, target, state, steps, from_direction, classes, costs, 
             straight_to_go = least * max(apart_x, apart_y) - diagonal_to_go
             total = (straight + straight_to_go) + (diagonal + diagonal_to_go) * SQRT2
             to_go = straight_to_go + diagonal_to_go * SQRT2
-            heap, size = _push(heap, size, total, to_go, neighbour)
+            heappush(heap, (total, to_go, neighbour))
     return False
-
-
-@njit(cache=True)
-def _push(heap, size, total, to_go, cell):  # pragma: no cover (compiled)
-    """Add an entry to the heap, growing it when full; return the heap and the new size."""
-    if size == len(heap):
-        grown = np.empty((2 * size, 3))
-        grown[:size] = heap
-        heap = grown
-    place = size
-    while place > 0:
-        parent = (place - 1) // 2
-        if not _is_before(total, to_go, heap[parent, TOTAL], heap[parent, TO_GO]):
-            break
-        _move(heap, parent, place)
-        place = parent
-    heap[place, TOTAL], heap[place, TO_GO], heap[place, CELL] = total, to_go, cell
-    return heap, size + 1
-
-
-@njit(cache=True)
-def _pop(heap, size):  # pragma: no cover (compiled)
-    """Remove the first entry of the heap; return the new size."""
-    size -= 1
-    total, to_go = heap[size, TOTAL], heap[size, TO_GO]
-    place = 0
-    while True:
-        child = 2 * place + 1
-        if child >= size:
-            break
-        right = child + 1
-        if right < size and _is_before(heap[right, TOTAL], heap[right, TO_GO], heap[child, TOTAL], heap[child, TO_GO]):
-            child = right
-        if not _is_before(heap[child, TOTAL], heap[child, TO_GO], total, to_go):
-            break
-        _move(heap, child, place)
-        place = child
-    _move(heap, size, place)
-    return size
-
-
-@njit(cache=True)
-def _move(heap, source, place):  # pragma: no cover (compiled)
-    for column in range(3):
-        heap[place, column] = heap[source, column]
-
-
-@njit(cache=True)
-def _is_before(total, to_go, other_total, other_to_go):  # pragma: no cover (compiled)
-    return total < other_total or (total == other_total and to_go < other_to_go)

@@ -7,7 +7,7 @@ can walk below a tree (`trunk`). The variants of the paper's SimWorld runs (app:
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -163,15 +163,7 @@ class SimplifyConfig(Config):
     nested_tolerance_m: float = Field(0.01, ge=0.0, description="length by which a nested box may stick out, m")
 
 
-@dataclass(frozen=True)
-class Simplification:
-    """A simplified map, and the name of each pass with the boxes by kind after it; the first entry is the input."""
-
-    box_map: BoxMap
-    passes: list[tuple[str, dict[str, int]]]
-
-
-def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> Simplification:
+def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> BoxMap:
     """Apply the passes in the paper's order.
 
     The result's header gains `passes`, with settings and counts. Ids: a merged box takes its smallest member's, a
@@ -190,14 +182,13 @@ def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> Simplification:
         "prune_nested": lambda m: prune_nested(m, cfg.nested_tolerance_m),
     }
     result = box_map
-    passes = [("input", box_map.counts())]
+    passes = [SimplifyPass(name="input", counts=box_map.counts())]
     for name, apply_pass in apply.items():
         if getattr(cfg, name):
             result = apply_pass(result)
-            passes.append((name, result.counts()))
-    records = [SimplifyPass(name=name, counts=counts) for name, counts in passes]
-    header = box_map.header.model_copy(update={"passes": records, "simplify": cfg.all_values()})
-    return Simplification(replace(result, header=header, meshes=Meshes()), passes)
+            passes.append(SimplifyPass(name=name, counts=result.counts()))
+    header = box_map.header.model_copy(update={"passes": passes, "simplify": cfg.all_values()})
+    return replace(result, header=header, meshes=Meshes())
 
 
 def _merge_groups(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:

@@ -7,12 +7,12 @@ import numpy as np
 
 from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.formats.kinds import KINDS, SURFACE_KINDS
-from cosfly.geometry.grid import blocks_walking, compare, connected_parts, empty_grid, inflate, occupancy
+from cosfly.geometry.grid import blocks_walking, connected_parts, empty_grid, inflate, occupancy
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, write_json
 from cosfly.runtime.run_dir import StageFolder, Tally
-from cosfly.simplify.passes import Simplification, SimplifyConfig, simplify
+from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.viz.topview import TopView, add_caption, draw_map, png_bytes
 
 PICTURE_PX = 1000  # longer side of each half of the picture
@@ -30,8 +30,6 @@ def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
     """
     grid = empty_grid(raw)
     before, after = (occupancy(m, like=grid) for m in (raw, simplified))
-    cell_agreement, iou = compare(before, after)
-    facts: dict = {"cells": list(grid.size), "cell_agreement": round(cell_agreement, 4), "iou": round(iou, 4)}
     was_occupied, is_occupied = before.occupied, after.occupied
     masks = {
         "free_in_both": ~was_occupied & ~is_occupied,
@@ -39,12 +37,20 @@ def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
         "raw_alone": was_occupied & ~is_occupied,
         "simplified_alone": is_occupied & ~was_occupied,
     }
-    facts["agreement"] = {name: int(mask.sum()) for name, mask in masks.items()}
+    counts = {name: int(mask.sum()) for name, mask in masks.items()}
+    num_alike, num_either = (
+        counts["free_in_both"] + counts["occupied_in_both"],
+        was_occupied.size - counts["free_in_both"],
+    )
+    facts: dict = {
+        "cells": list(grid.size), "cell_agreement": round(num_alike / was_occupied.size, 4),
+        "iou": round(counts["occupied_in_both"] / num_either, 4) if num_either else 1.0, "agreement": counts,
+    }  # fmt: skip
     for kind in ("Vegetation", "Buildings"):
         is_under = np.zeros_like(was_occupied)
         for box_map in (raw, simplified):
             is_under |= occupancy(box_map.select(box_map.kinds == KINDS[kind]), like=grid).occupied
-        facts["agreement"][f"differ_under_{kind}"] = int(((was_occupied != is_occupied) & is_under).sum())
+        counts[f"differ_under_{kind}"] = int(((was_occupied != is_occupied) & is_under).sum())
     for name, grid_of_map in (("raw", before), ("simplified", after)):
         _, sizes = connected_parts(~inflate(grid_of_map, SAFETY_RADIUS_M).occupied, 8)
         cell_m2 = grid.resolution_m**2
@@ -53,14 +59,15 @@ def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
     return facts
 
 
-def report(raw: BoxMap, result: Simplification) -> dict:
+def report(raw: BoxMap, result: BoxMap) -> dict:
     """Return the content of `simplify_report.json`."""
-    obstacles = {"raw": int(blocks_walking(raw).sum()), "simplified": int(blocks_walking(result.box_map).sum())}
+    passes = [(one.name, one.counts) for one in result.header.passes]
+    obstacles = {"raw": int(blocks_walking(raw).sum()), "simplified": int(blocks_walking(result).sum())}
     return {
-        **REPORT_FORMAT.header, "name": raw.name, "num_boxes": {"raw": len(raw), "simplified": len(result.box_map)},
+        **REPORT_FORMAT.header, "name": raw.name, "num_boxes": {"raw": len(raw), "simplified": len(result)},
         "obstacles_at_walking_height": obstacles,
-        "passes": [{"pass": name, "num_boxes": sum(c.values()), "counts": c} for name, c in result.passes],
-        "grid": cross_validate(raw, result.box_map),
+        "passes": [{"pass": name, "num_boxes": sum(counts.values()), "counts": counts} for name, counts in passes],
+        "grid": cross_validate(raw, result),
     }  # fmt: skip
 
 
@@ -72,26 +79,26 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path) -> Path:
         return product
     raw = read_boxes(maps)
     result = simplify(raw, cfg)
-    if len(result.box_map) == 0:
+    if len(result) == 0:
         raise InputError(
             "every box of the map lies below the ground",
             where=maps,
             expected="boxes above the ground",
             fix="correct ground_z_m in the header of the map",
         )
-    write_boxes(product, result.box_map)
+    write_boxes(product, result)
     facts = report(raw, result)
     write_json(out / "simplify_report.json", facts)
     view = TopView.around(np.stack(raw.bounds()), PICTURE_PX)
     halves = []
-    for title, box_map in (("raw", raw), ("simplified", result.box_map)):  # obstacles at walking height, side by side
+    for title, box_map in (("raw", raw), ("simplified", result)):  # obstacles at walking height, side by side
         shown = box_map.select(box_map.is_any_of(SURFACE_KINDS) | blocks_walking(box_map))
         area = facts["grid"][f"{title}_walkable_m2"]
         text = f"{title}: {len(box_map)} boxes, {area:.0f} m2 walkable (drawn: boxes below 2 m)"
         halves.append(add_caption(draw_map(shown, view), text))
     write_bytes(out / "simplify.png", png_bytes(np.hstack(halves)))
-    num_new = len(np.setdiff1d(result.box_map.ids, raw.ids))
-    log.info("%d boxes became %d, of which %d are stems and pieces of trees", len(raw), len(result.box_map), num_new)
+    num_new = len(np.setdiff1d(result.ids, raw.ids))
+    log.info("%d boxes became %d, of which %d are stems and pieces of trees", len(raw), len(result), num_new)
     tally = Tally(input=1, kept=1)
     stage.finish([product, out / "simplify_report.json", out / "simplify.png"], tally, num_boxes=facts["num_boxes"])
     return product

@@ -46,7 +46,7 @@ SIZE_PX, FOV_DEG = (640, 360), 50.0
 
 def traces_of(cfg: RunConfig, name: str) -> Iterator[DroneTrace]:
     town = cfg.of_town(name)
-    box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify).box_map
+    box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify)
     ground, ids = walkable_ground(box_map, town.pedestrians), map(walk_id, range(town.pedestrians.num_paths))
     walks = [
         make_pedestrian(id_, ground, town.pedestrians, rng_for(town.seed, "pedestrians", id_)).trajectory for id_ in ids

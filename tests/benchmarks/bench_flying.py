@@ -77,7 +77,7 @@ def main() -> None:
         root = Path(name)
         box_map = load_map(MapsConfig(), seed=SEED)
         write_boxes(root / "boxes_3d.json", box_map)
-        write_boxes(root / "step2_simplified.json", simplify(box_map, SimplifyConfig()).box_map)
+        write_boxes(root / "step2_simplified.json", simplify(box_map, SimplifyConfig()))
         walks = PedestriansConfig(num_paths=asked.flights, min_distance_m=140, max_distance_m=220, ground="paved")
         how = {"seed": SEED, "workers": asked.workers}
         paths = pedestrians.run(walks, root / "step2_simplified.json", root / "walks", **how)

@@ -39,7 +39,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         root = Path(name)
         write_boxes(root / "map.json", box_map)
-        write_boxes(root / "simple.json", simplify(box_map, SimplifyConfig()).box_map)
+        write_boxes(root / "simple.json", simplify(box_map, SimplifyConfig()))
         with browser(root / "profile") as page:
             open_editor(root / "simple.json", PedestriansConfig(), root / "warm.json", 0).http.server_close()
             start = time.perf_counter()

@@ -57,7 +57,7 @@ def cut_to(box_map: BoxMap, size_m: tuple[float, float]) -> BoxMap:
 
 
 def simplified(raw: BoxMap) -> BoxMap:
-    return simplify(raw, SimplifyConfig()).box_map
+    return simplify(raw, SimplifyConfig())
 
 
 def walks_on(box_map: BoxMap, **settings: Any) -> list[PedestrianTrajectory]:
