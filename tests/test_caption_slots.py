@@ -36,37 +36,37 @@ def filled(text: str, language: Language, facts: Facts = FACTS) -> str | Refused
         return Refused("invalid_slot", str(error))
 
 
-@pytest.mark.parametrize(("language", "template", "text"), [
-    ("en", "The gap {trend:distance} from {distance@t0} to {distance}.", "The gap decreases from 20.0 m to 18.0 m."),
-    ("en", "The gap is now {trend:distance}.", "The gap is now decreasing."),
-    ("en", "The gap has {trend:distance} to {distance}.", "The gap has decreased to 18.0 m."),
-    ("en", "A {trend:speed} pace and a {trend:distance} gap.", "An increasing pace and a decreasing gap."),
-    ("en", "It lies {offset_x} to the {side:offset_x} of the middle.", "It lies 64 px to the left of the middle."),
-    ("en", "An offset of {offset_x} is large.", "An offset of -64 px is large."),  # no slot says its side
-    ("en", "The nose swung {yaw} {side:yaw}, at {yaw_rate}.", "The nose swung 10.0 deg right, at -8.0 deg/s."),
-    ("en", "It was {yaw@t2} to the {side:yaw@t2} at t2.", "It was 3.0 deg to the left at t2."),
-    ("en", "The height {trend:altitude} by {change:altitude}.", "The height increases by 2.0 m."),
-    ("en", "The box measures {box@t4} now, {box@t0} then.", "The box measures 36 x 72 px now, 30 x 60 px then."),
-    ("en", "The box {trend:box_height} by {growth:box_height}.", "The box increases by 20%."),
-    ("en", "Pitch is {pitch} here.", "Pitch is -40.3 deg here."),
-    ("en", "It was {visibility@t3} at t3.", "It was occluded at t3."),
-    ("en", "The drone is {comparison:speed} the walker.", "The drone is faster than the walker."),
-    ("en", "The drone is {comparison:speed} than the walker.", "The drone is faster than the walker."),
-    ("en", "The drone is {comparison:speed}.", "The drone is faster."),
-    ("en", "The gap is {distance} m wide.", "The gap is 18.0 m wide."),  # the unit once
-    ("en", "At {speed} m/s it flies.", "At 4.00 m/s it flies."),
-    ("en", "It should {decision}, to the {side:decision}.", "It should yaw right to follow, to the right."),
-    ("en", "{Distance @ t0} it was.", "20.0 m it was."),
-    ("en", "The walker {target_motion} and is {target_motion}.", "The walker walks and is walking."),
-    ("zh", "水平距离从 {distance@t0}{trend:distance}到 {distance}。", "水平距离从 20.0 米减小到 18.0 米。"),
-    ("zh", "目标位于画面中心{side:offset_x}侧 {offset_x} 处。", "目标位于画面中心左侧 64 像素处。"),
-    ("zh", "边界框为 {box@t4}。", "边界框为 36 × 72 像素。"),
-    ("zh", "无人机{comparison:speed}目标，因此{decision}。", "无人机快于目标，因此向右偏航跟随。"),
-    ("zh", "t3 时目标{visibility@t3}。", "t3 时目标被遮挡。"),
-    ("zh", "高度为 {altitude} 米。", "高度为 22.0 米。"),
-])  # fmt: skip
-def test_what_a_template_becomes(language, template, text):
-    assert filled(template, language) == text
+def test_what_a_template_becomes():
+    for language, template, text in [
+        ("en", "The gap {trend:distance} from {distance@t0} to {distance}.", "The gap decreases from 20.0 m to 18.0 m."),
+        ("en", "The gap is now {trend:distance}.", "The gap is now decreasing."),
+        ("en", "The gap has {trend:distance} to {distance}.", "The gap has decreased to 18.0 m."),
+        ("en", "A {trend:speed} pace and a {trend:distance} gap.", "An increasing pace and a decreasing gap."),
+        ("en", "It lies {offset_x} to the {side:offset_x} of the middle.", "It lies 64 px to the left of the middle."),
+        ("en", "An offset of {offset_x} is large.", "An offset of -64 px is large."),  # no slot says its side
+        ("en", "The nose swung {yaw} {side:yaw}, at {yaw_rate}.", "The nose swung 10.0 deg right, at -8.0 deg/s."),
+        ("en", "It was {yaw@t2} to the {side:yaw@t2} at t2.", "It was 3.0 deg to the left at t2."),
+        ("en", "The height {trend:altitude} by {change:altitude}.", "The height increases by 2.0 m."),
+        ("en", "The box measures {box@t4} now, {box@t0} then.", "The box measures 36 x 72 px now, 30 x 60 px then."),
+        ("en", "The box {trend:box_height} by {growth:box_height}.", "The box increases by 20%."),
+        ("en", "Pitch is {pitch} here.", "Pitch is -40.3 deg here."),
+        ("en", "It was {visibility@t3} at t3.", "It was occluded at t3."),
+        ("en", "The drone is {comparison:speed} the walker.", "The drone is faster than the walker."),
+        ("en", "The drone is {comparison:speed} than the walker.", "The drone is faster than the walker."),
+        ("en", "The drone is {comparison:speed}.", "The drone is faster."),
+        ("en", "The gap is {distance} m wide.", "The gap is 18.0 m wide."),  # the unit once
+        ("en", "At {speed} m/s it flies.", "At 4.00 m/s it flies."),
+        ("en", "It should {decision}, to the {side:decision}.", "It should yaw right to follow, to the right."),
+        ("en", "{Distance @ t0} it was.", "20.0 m it was."),
+        ("en", "The walker {target_motion} and is {target_motion}.", "The walker walks and is walking."),
+        ("zh", "水平距离从 {distance@t0}{trend:distance}到 {distance}。", "水平距离从 20.0 米减小到 18.0 米。"),
+        ("zh", "目标位于画面中心{side:offset_x}侧 {offset_x} 处。", "目标位于画面中心左侧 64 像素处。"),
+        ("zh", "边界框为 {box@t4}。", "边界框为 36 × 72 像素。"),
+        ("zh", "无人机{comparison:speed}目标，因此{decision}。", "无人机快于目标，因此向右偏航跟随。"),
+        ("zh", "t3 时目标{visibility@t3}。", "t3 时目标被遮挡。"),
+        ("zh", "高度为 {altitude} 米。", "高度为 22.0 米。"),
+    ]:  # fmt: skip
+        assert filled(template, language) == text
 
 
 REFUSED = [
@@ -87,12 +87,12 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("language", "text", "words"), REFUSED)
-def test_a_refused_slot_names_the_fault_and_the_fix(language, text, words):
-    found = filled(text, language)
-    assert isinstance(found, Refused)
-    assert found.reason == "invalid_slot"
-    assert words in found.complaint
+def test_a_refused_slot_names_the_fault_and_the_fix():
+    for language, text, words in REFUSED:
+        found = filled(text, language)
+        assert isinstance(found, Refused)
+        assert found.reason == "invalid_slot"
+        assert words in found.complaint
 
 
 def windows_of(num_flights: int) -> list[Facts]:
@@ -167,23 +167,23 @@ def drafts(english: str, chinese: str) -> Draft | Refused:
     return SLOTS.read_mirror(zh, first, FACTS, True)
 
 
-@pytest.mark.parametrize(("english", "chinese", "reason"), [
-    ("The gap {trend:distance} to {distance}.", "距离{trend:distance}到 {distance}。", None),
-    ("With {distance} the gap {trend:distance}.", "距离{trend:distance}，为 {distance}。", None),  # another order
-    ("The gap is {distance}. It should {decision}.", "距离为 {distance}，应{decision}。", "sentences"),
-    ("The gap {trend:distance} to {distance}.", "距离为 {distance}。", "slots"),
-    ("The gap is {distance}.", "距离为 {altitude}。", "slots"),
-    ("The gap is {distance@t0}.", "距离为 {distance}。", "slots"),
-    ("The gap is {distance}.", "The gap is {distance}。", "script"),
-    ("The gap is {distance}.", "距离为 {distanse}。", "invalid_slot"),
-    ("The gap of {distance} shrinks.", "距离 {distance}正在扩大。", "polarity_trend"),
-    ("The altitude is {altitude}.", "海拔为 {altitude}。", "glossary"),
-])  # fmt: skip
-def test_the_mirror_holds_the_same_slots_sentence_by_sentence(english, chinese, reason):
-    found = drafts(english, chinese)
-    assert (found.reason if isinstance(found, Refused) else None) == reason
-    if isinstance(found, Refused):
-        assert found.complaint
+def test_the_mirror_holds_the_same_slots_sentence_by_sentence():
+    for english, chinese, reason in [
+        ("The gap {trend:distance} to {distance}.", "距离{trend:distance}到 {distance}。", None),
+        ("With {distance} the gap {trend:distance}.", "距离{trend:distance}，为 {distance}。", None),  # another order
+        ("The gap is {distance}. It should {decision}.", "距离为 {distance}，应{decision}。", "sentences"),
+        ("The gap {trend:distance} to {distance}.", "距离为 {distance}。", "slots"),
+        ("The gap is {distance}.", "距离为 {altitude}。", "slots"),
+        ("The gap is {distance@t0}.", "距离为 {distance}。", "slots"),
+        ("The gap is {distance}.", "The gap is {distance}。", "script"),
+        ("The gap is {distance}.", "距离为 {distanse}。", "invalid_slot"),
+        ("The gap of {distance} shrinks.", "距离 {distance}正在扩大。", "polarity_trend"),
+        ("The altitude is {altitude}.", "海拔为 {altitude}。", "glossary"),
+    ]:  # fmt: skip
+        found = drafts(english, chinese)
+        assert (found.reason if isinstance(found, Refused) else None) == reason
+        if isinstance(found, Refused):
+            assert found.complaint
 
 
 def test_numbers_outside_slots_are_compared_with_the_facts():
@@ -279,47 +279,47 @@ def test_the_question_shows_what_is_known_by_its_slot(tree, tmp_path):
 LEFTWARD = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, 6.0, 10.0))
 
 
-@pytest.mark.parametrize(("address", "fact"), [
-    ("distance", Fact(18.0, "m", 1)),
-    ("distance@t3", "unknown_fact"),
-    ("distance@t5", "unobserved_frame"),
-    ("change:distance", Fact(-2.0, "m", 1)),
-    ("growth:box_height", Fact(20.0, "percent", 0)),
-    ("rate:altitude@t3-t4", Fact(2.0, "mps", 1)),
-    ("rate:yaw@t2-t4", Fact(7.0, "dps", 1)),
-    ("climb_rate@t2", Fact(1.0, "mps", 2)),
-    ("mean:speed", Fact(2.75, "mps", 2)),
-    ("mean:speed@t2-t4", Fact(3.17, "mps", 2)),
-    ("mean:target_speed", Fact(1.6, "mps", 2)),
-    ("change:target_heading", "unknown_fact"),
-    ("side:yaw", Fact("left")),
-    ("side:offset_x", Fact("left")),
-    ("side:offset_x@t1", Fact("centred")),
-    ("side:offset_y", Fact("below")),
-    ("trend:speed", Fact("increasing")),
-    ("trend:pitch", Fact("steady")),
-    ("trend:distance", Fact("decreasing")),
-    ("comparison:speed", Fact("faster")),
-    ("visibility@t3", Fact("occluded")),
-    ("target_motion", Fact("walking")),
-    ("drone_motion", Fact("moving")),
-    ("bearing", "unknown_fact"),
-    ("sideways_speed", Fact(0.0, "mps", 2)),
-    ("forward_speed@t3", "unknown_fact"),
-])  # fmt: skip
-def test_the_fact_at_an_address(address, fact):
-    reference = parse_reference(address)
-    assert reference is not None
-    assert look_up(reference, LEFTWARD) == fact
-    assert parse_reference(str(reference)) == reference
+def test_the_fact_at_an_address():
+    for address, fact in [
+        ("distance", Fact(18.0, "m", 1)),
+        ("distance@t3", "unknown_fact"),
+        ("distance@t5", "unobserved_frame"),
+        ("change:distance", Fact(-2.0, "m", 1)),
+        ("growth:box_height", Fact(20.0, "percent", 0)),
+        ("rate:altitude@t3-t4", Fact(2.0, "mps", 1)),
+        ("rate:yaw@t2-t4", Fact(7.0, "dps", 1)),
+        ("climb_rate@t2", Fact(1.0, "mps", 2)),
+        ("mean:speed", Fact(2.75, "mps", 2)),
+        ("mean:speed@t2-t4", Fact(3.17, "mps", 2)),
+        ("mean:target_speed", Fact(1.6, "mps", 2)),
+        ("change:target_heading", "unknown_fact"),
+        ("side:yaw", Fact("left")),
+        ("side:offset_x", Fact("left")),
+        ("side:offset_x@t1", Fact("centred")),
+        ("side:offset_y", Fact("below")),
+        ("trend:speed", Fact("increasing")),
+        ("trend:pitch", Fact("steady")),
+        ("trend:distance", Fact("decreasing")),
+        ("comparison:speed", Fact("faster")),
+        ("visibility@t3", Fact("occluded")),
+        ("target_motion", Fact("walking")),
+        ("drone_motion", Fact("moving")),
+        ("bearing", "unknown_fact"),
+        ("sideways_speed", Fact(0.0, "mps", 2)),
+        ("forward_speed@t3", "unknown_fact"),
+    ]:  # fmt: skip
+        reference = parse_reference(address)
+        assert reference is not None
+        assert look_up(reference, LEFTWARD) == fact
+        assert parse_reference(str(reference)) == reference
 
 
-@pytest.mark.parametrize("address", [
-    "", "colour", "distance@now", "distance@t0-t4", "trend:visibility", "side:distance", "sum:distance", "change:",
-    "x" * 9,
-])  # fmt: skip
-def test_what_names_nothing(address):
-    assert parse_reference(address) is None
+def test_what_names_nothing():
+    for address in [
+        "", "colour", "distance@now", "distance@t0-t4", "trend:visibility", "side:distance", "sum:distance", "change:",
+        "x" * 9,
+    ]:  # fmt: skip
+        assert parse_reference(address) is None
 
 
 def test_a_series_that_ends_where_it_began_has_no_trend():

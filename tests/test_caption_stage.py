@@ -245,17 +245,17 @@ def test_a_comparison_by_hand():
     assert [one.row[:4] for one in (found, nothing)] == [("hint", "2", "33.3 %", "62.5 %"), ("hint", "0", "0.0 %", "-")]
 
 
-@pytest.mark.parametrize(("text", "verdict"), [
-    ('{"verdict": "FIX_LABEL", "reason": "the text argues for the label"}', "FIX_LABEL"),
-    ("ACCEPT_ALTERNATIVE", UNJUDGED),
-    ('{"verdict": "ACCEPT", "reason": "fine"}', UNJUDGED),
-    ('{"verdict": "ACCEPT_ALTERNATIVE"}', UNJUDGED),
-    ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": " "}', UNJUDGED),
-    ('{"verdict": ["ACCEPT_ALTERNATIVE"], "reason": "x"}', UNJUDGED),
-    ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": "x"} {"verdict": "REJECT_REGEN", "reason": "y"}', "REJECT_REGEN"),
-])  # fmt: skip
-def test_reading_a_judgement(text, verdict):
-    assert parse_judgement(text)[0] == verdict
+def test_reading_a_judgement():
+    for text, verdict in [
+        ('{"verdict": "FIX_LABEL", "reason": "the text argues for the label"}', "FIX_LABEL"),
+        ("ACCEPT_ALTERNATIVE", UNJUDGED),
+        ('{"verdict": "ACCEPT", "reason": "fine"}', UNJUDGED),
+        ('{"verdict": "ACCEPT_ALTERNATIVE"}', UNJUDGED),
+        ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": " "}', UNJUDGED),
+        ('{"verdict": ["ACCEPT_ALTERNATIVE"], "reason": "x"}', UNJUDGED),
+        ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": "x"} {"verdict": "REJECT_REGEN", "reason": "y"}', "REJECT_REGEN"),
+    ]:  # fmt: skip
+        assert parse_judgement(text)[0] == verdict
 
 
 def teacher_in_conflict(**options) -> TeacherServer:

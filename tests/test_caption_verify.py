@@ -8,7 +8,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from specimens_captions import make_facts, write_answers
@@ -76,48 +75,48 @@ def pair(en: str, zh: str) -> tuple[Coc, Coc]:
     )
 
 
-@pytest.mark.parametrize(("en", "zh", "reason"), [
-    ("the target is on the left", "目标在左侧", None),
-    ("the target is on the left", "目标在右侧", "polarity_side"),
-    ("the target is right now on the left", "目标此刻在左侧", None),
-    ("about 3 m to the left", "左侧 3 米左右", None),
-    ("the drone climbs", "无人机下降", "polarity_vertical"),
-    ("the drone ascends", "无人机上升", None),
-    ("the gap decreases", "间距增大", "polarity_trend"),
-    ("the target is visible", "目标被遮挡", "polarity_visibility"),
-    ("the target is visible", "目标不可见", "polarity_visibility"),
-    ("the target is not visible", "目标不可见", None),
-    ("the target is not occluded", "目标无遮挡", None),
-    ("the target is occluded", "目标未被遮挡", "polarity_visibility"),
-    ("it turns left, then right, then left", "先向左，再向右，再向右", "polarity_side"),
-    ("the target is 12.5 m away", "目标在 12.5 米处", None),
-    ("the target is 12.5 m away", "目标在 15.2 米处", "number"),
-    ("the target is 12.5 m away", "目标速度 12.5 米/秒", "number"),  # same digits, another unit
-    ("over 5 frames", "在五帧中", None),
-])  # fmt: skip
-def test_mirror_check(en, zh, reason):
-    assert check_mirror(*pair(en, zh), make_facts()) == reason
+def test_mirror_check():
+    for en, zh, reason in [
+        ("the target is on the left", "目标在左侧", None),
+        ("the target is on the left", "目标在右侧", "polarity_side"),
+        ("the target is right now on the left", "目标此刻在左侧", None),
+        ("about 3 m to the left", "左侧 3 米左右", None),
+        ("the drone climbs", "无人机下降", "polarity_vertical"),
+        ("the drone ascends", "无人机上升", None),
+        ("the gap decreases", "间距增大", "polarity_trend"),
+        ("the target is visible", "目标被遮挡", "polarity_visibility"),
+        ("the target is visible", "目标不可见", "polarity_visibility"),
+        ("the target is not visible", "目标不可见", None),
+        ("the target is not occluded", "目标无遮挡", None),
+        ("the target is occluded", "目标未被遮挡", "polarity_visibility"),
+        ("it turns left, then right, then left", "先向左，再向右，再向右", "polarity_side"),
+        ("the target is 12.5 m away", "目标在 12.5 米处", None),
+        ("the target is 12.5 m away", "目标在 15.2 米处", "number"),
+        ("the target is 12.5 m away", "目标速度 12.5 米/秒", "number"),  # same digits, another unit
+        ("over 5 frames", "在五帧中", None),
+    ]:  # fmt: skip
+        assert check_mirror(*pair(en, zh), make_facts()) == reason
 
 
-@pytest.mark.parametrize(("text", "is_contradicted"), [
-    ("The horizontal distance increases from 20.0 m to 21.4 m.", False),
-    ("The horizontal distance decreases from 20.0 m to 21.4 m.", False),  # words are not checked
-    ("The horizontal distance is 47.0 m.", True),
-    ("The gap has grown by 1.4 m, about 0.7 m/s.", False),  # a difference and a rate
-    ("The altitude is 24.9 m.", True),
-    ("It lies 21.4 m away at an angle of 45 degrees.", False),
-    ("The drone flies at 1.46 m/s.", False),
-    ("The drone flies at 20.6 m/s.", True),
-    ("It is roughly 21 metres away.", False),
-    ("It is roughly 40 metres away.", True),
-    ("The drone flies at 3.3 ft/s, 1.02 m/s.", False),  # a foreign unit of the same speed
-    ("The distance should stay below 55 m.", False),  # a plan
-    ("The manual allows no gap of more than 55 m.", False),
-    ("The bounding box is 59 x 34 px.", False),
-    ("Over 2 seconds and 5 frames nothing changes.", False),
-])  # fmt: skip
-def test_a_number_that_matches_no_fact_of_its_unit_is_contradicted(text, is_contradicted):
-    assert bool(check_values([text], PAPER_FACTS, "en").contradictions) == is_contradicted
+def test_a_number_that_matches_no_fact_of_its_unit_is_contradicted():
+    for text, is_contradicted in [
+        ("The horizontal distance increases from 20.0 m to 21.4 m.", False),
+        ("The horizontal distance decreases from 20.0 m to 21.4 m.", False),  # words are not checked
+        ("The horizontal distance is 47.0 m.", True),
+        ("The gap has grown by 1.4 m, about 0.7 m/s.", False),  # a difference and a rate
+        ("The altitude is 24.9 m.", True),
+        ("It lies 21.4 m away at an angle of 45 degrees.", False),
+        ("The drone flies at 1.46 m/s.", False),
+        ("The drone flies at 20.6 m/s.", True),
+        ("It is roughly 21 metres away.", False),
+        ("It is roughly 40 metres away.", True),
+        ("The drone flies at 3.3 ft/s, 1.02 m/s.", False),  # a foreign unit of the same speed
+        ("The distance should stay below 55 m.", False),  # a plan
+        ("The manual allows no gap of more than 55 m.", False),
+        ("The bounding box is 59 x 34 px.", False),
+        ("Over 2 seconds and 5 frames nothing changes.", False),
+    ]:  # fmt: skip
+        assert bool(check_values([text], PAPER_FACTS, "en").contradictions) == is_contradicted
 
 
 def test_free_prose_of_another_hand(shared_data):
@@ -164,17 +163,17 @@ def test_rule_captions_are_one_record_in_two_languages():
         assert check_mirror(en, bad, facts) == "number"
 
 
-@pytest.mark.parametrize("decision", TOKENS)
-def test_the_rule_teacher_justifies_any_given_decision_without_contradiction(decision):
-    for facts, _, _ in clean_captions(2)[::7]:
-        answers = write_answers(facts, np.random.default_rng(3), decision)
-        if answers is None:
-            continue  # dropped as `no_reason`
-        english, chinese = answers
-        assert english.flight_decision == chinese.flight_decision == decision
-        assert contradictions_of(english, facts, "en") == contradictions_of(chinese, facts, "zh") == []
-        assert check_mirror(english, chinese, facts) is None
-        assert ACTIONS[decision].zh in chinese.reasoning_trace
+def test_the_rule_teacher_justifies_any_given_decision_without_contradiction():
+    for decision in TOKENS:
+        for facts, _, _ in clean_captions(2)[::7]:
+            answers = write_answers(facts, np.random.default_rng(3), decision)
+            if answers is None:
+                continue  # dropped as `no_reason`
+            english, chinese = answers
+            assert english.flight_decision == chinese.flight_decision == decision
+            assert contradictions_of(english, facts, "en") == contradictions_of(chinese, facts, "zh") == []
+            assert check_mirror(english, chinese, facts) is None
+            assert ACTIONS[decision].zh in chinese.reasoning_trace
 
 
 THRESHOLDS = Thresholds()
@@ -247,9 +246,9 @@ LABELS = [
 ]
 
 
-@pytest.mark.parametrize(("motion", "label"), LABELS)
-def test_label_of_a_known_future(motion, label):
-    assert TABLE.label_of(measure(future(**motion))) == label
+def test_label_of_a_known_future():
+    for motion, label in LABELS:
+        assert TABLE.label_of(measure(future(**motion))) == label
 
 
 STEADY = {"forward": 3.0, "target_step": (0.6, 0.0)}  # straight and level behind a walker
@@ -283,11 +282,11 @@ HARD = [  # the opposite, then what is plainly not there
 ]
 
 
-@pytest.mark.parametrize(("decision", "motion"), HARD)
-def test_contradiction_of_each_action(decision, motion):
-    measured = measure(future(**motion))
-    label = TABLE.label_of(measured)
-    assert verdict_on(decision, label, TABLE.contradicted_by(measured, label)) == "HARD_CONFLICT"
+def test_contradiction_of_each_action():
+    for decision, motion in HARD:
+        measured = measure(future(**motion))
+        label = TABLE.label_of(measured)
+        assert verdict_on(decision, label, TABLE.contradicted_by(measured, label)) == "HARD_CONFLICT"
 
 
 coordinate = st.floats(-6.0, 6.0, allow_nan=False, width=32)

@@ -47,7 +47,7 @@ def test_boxes_round_trip(tmp_path_factory, n, seed):
     assert path.read_bytes() == first  # idempotent
 
 
-@each(
+@pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda value: value.update(axes="y up"), r"axes: .*got y up; expected right-handed"),

@@ -120,9 +120,8 @@ def one_box(center, half_extents, rotation_deg=(0, 0, 0), kind=BUILDINGS):
     return make_box_map([center], [half_extents], [rotation_deg], [kind])
 
 
-@pytest.mark.parametrize(
-    ("bottom_m", "top_m", "kind", "blocks"),
-    [
+def test_only_boxes_at_a_persons_height_block():
+    for bottom_m, top_m, kind, blocks in [
         (0.0, 3.0, BUILDINGS, True),
         (-5.0, 0.0, BUILDINGS, False),  # ends at the ground
         (-5.0, 0.1, BUILDINGS, True),
@@ -133,12 +132,10 @@ def one_box(center, half_extents, rotation_deg=(0, 0, 0), kind=BUILDINGS):
         (-0.2, 0.3, ROADS, False),
         (-4.0, -1.0, WATER, True),
         (0.0, 1.0, WATER, True),
-    ],
-)
-def test_only_boxes_at_a_persons_height_block(bottom_m, top_m, kind, blocks):
-    box_map = one_box((0, 0, (bottom_m + top_m) / 2), (1, 1, (top_m - bottom_m) / 2), kind=kind)
-    assert blocks_walking(box_map).tolist() == [blocks]
-    assert occupancy(box_map).occupied.any() == blocks
+    ]:
+        box_map = one_box((0, 0, (bottom_m + top_m) / 2), (1, 1, (top_m - bottom_m) / 2), kind=kind)
+        assert blocks_walking(box_map).tolist() == [blocks]
+        assert occupancy(box_map).occupied.any() == blocks
 
 
 @settings(max_examples=60)
@@ -254,23 +251,23 @@ def test_segments_agree_with_plane_clipping(inflate_m):
     np.testing.assert_array_equal(kernels.segments_hit(index, starts, ends, inflate_m), expected)
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_the_way_between_points_agrees_with_many_points_on_it(seed):
-    rng = np.random.default_rng(seed)
-    index = random_boxes(rng, 12, spread_m=20.0)
-    points = np.cumsum(rng.normal(0, 3, (30, 3)), axis=0)
-    gaps, shares, boxes = kernels.swept_distances(index, points, 100.0)
-    ends = points[:-1], points[1:]
-    between = np.linspace(0, 1, 1001)[:, None, None]
-    fine = (ends[0] * (1 - between) + ends[1] * between).reshape(-1, 3)
-    dense = slow_distances(index, fine).min(axis=1).reshape(1001, -1)
-    outside = np.maximum(dense.min(axis=0), 0.0)
-    np.testing.assert_allclose(np.maximum(gaps[:-1], 0.0), outside, atol=1e-3)
-    assert (np.maximum(gaps[:-1], 0.0) <= outside + 1e-9).all()
-    at = ends[0] + shares[:-1, None] * (ends[1] - ends[0])
-    found = slow_distances(index, at)[np.arange(len(at)), boxes[:-1]]
-    np.testing.assert_allclose(np.maximum(found, 0.0), np.maximum(gaps[:-1], 0.0), atol=1e-9)
-    assert gaps[-1] == pytest.approx(slow_distances(index, points[-1:]).min())
+def test_the_way_between_points_agrees_with_many_points_on_it():
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        index = random_boxes(rng, 12, spread_m=20.0)
+        points = np.cumsum(rng.normal(0, 3, (30, 3)), axis=0)
+        gaps, shares, boxes = kernels.swept_distances(index, points, 100.0)
+        ends = points[:-1], points[1:]
+        between = np.linspace(0, 1, 1001)[:, None, None]
+        fine = (ends[0] * (1 - between) + ends[1] * between).reshape(-1, 3)
+        dense = slow_distances(index, fine).min(axis=1).reshape(1001, -1)
+        outside = np.maximum(dense.min(axis=0), 0.0)
+        np.testing.assert_allclose(np.maximum(gaps[:-1], 0.0), outside, atol=1e-3)
+        assert (np.maximum(gaps[:-1], 0.0) <= outside + 1e-9).all()
+        at = ends[0] + shares[:-1, None] * (ends[1] - ends[0])
+        found = slow_distances(index, at)[np.arange(len(at)), boxes[:-1]]
+        np.testing.assert_allclose(np.maximum(found, 0.0), np.maximum(gaps[:-1], 0.0), atol=1e-9)
+        assert gaps[-1] == pytest.approx(slow_distances(index, points[-1:]).min())
 
 
 def test_visibility_agrees_with_slow_rays():

@@ -382,9 +382,8 @@ def footprints(**attributes: object) -> Model:
     return model
 
 
-@pytest.mark.parametrize(
-    ("attributes", "height_m"),
-    [
+def test_declared_heights_raise_footprints(tmp_path):
+    for attributes, height_m in [
         ({"measuredHeight": 9}, 9.0),
         ({"measuredHeight": "9 m"}, 9.0),
         ({"measuredHeight": {"value": 30, "uom": "m"}}, 30.0),
@@ -394,15 +393,13 @@ def footprints(**attributes: object) -> Model:
         ({"measuredHeight": -3}, None),
         ({"measuredHeight": "high"}, None),
         ({"measuredHeight": 1e9}, None),
-    ],
-)
-def test_declared_heights_raise_footprints(tmp_path, attributes, height_m):
-    box_map = load(tmp_path, document(footprints(**attributes)))
-    header, standing = box_map.header, box_map.select(box_map.kinds == KINDS["Buildings"])
-    heights = [7.5] if height_m is None else [height_m, 7.5]
-    np.testing.assert_allclose(2 * standing.half_extents[:, 2], heights)
-    assert header.dropped_objects == ({"no_height": 1} if height_m is None else {})
-    assert len(box_map.meshes.refs) == len(heights)
+    ]:
+        box_map = load(tmp_path, document(footprints(**attributes)))
+        header, standing = box_map.header, box_map.select(box_map.kinds == KINDS["Buildings"])
+        heights = [7.5] if height_m is None else [height_m, 7.5]
+        np.testing.assert_allclose(2 * standing.half_extents[:, 2], heights)
+        assert header.dropped_objects == ({"no_height": 1} if height_m is None else {})
+        assert len(box_map.meshes.refs) == len(heights)
 
 
 def test_units_of_a_city_model_are_used_or_refused_by_name(tmp_path, subtests):

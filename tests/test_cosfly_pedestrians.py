@@ -332,23 +332,23 @@ def street(*, marked: bool = False) -> BoxList:
     return boxes
 
 
-@pytest.mark.parametrize(("way", "marked", "counts"), [
-    ([[20.25, -6.25], [20.25, 6.25]], False, (16, 0)),  # straight across, 8 m at two points a metre
-    ([[20.25, -6.25], [20.25, 6.25]], True, (16, 0)),  # beside the stripes
-    ([[10.25, -6.25], [10.25, 6.25]], True, (0, 16)),
-    ([[14.25, 0.25], [34.25, 0.25]], False, (41, 0)),  # along the street
-    ([[14.25, 6.25], [34.25, 6.25]], False, (0, 0)),
-    ([[-6.25, -6.25], [6.25, 6.25]], False, (16, 0)),  # over the junction from corner to corner
-])  # fmt: skip
-def test_points_are_counted_by_where_they_are(way, marked, counts):
-    start, goal = np.array(way)
-    length = np.abs(goal - start).max()
-    places = start + np.linspace(0, 1, int(2 * length) + 1)[:, None] * (goal - start)
-    walk = PedestrianTrajectory(
-        "p", places, np.arange(len(places)) * 0.5, np.pad(places, ((0, 0), (0, 1))), np.ones(len(places))
-    )
-    ground = walkable_ground(street(marked=marked).box_map(), KERB_CFG)
-    assert count_on_road(walk, ground.footing, ground.grid) == counts
+def test_points_are_counted_by_where_they_are():
+    for way, marked, counts in [
+        ([[20.25, -6.25], [20.25, 6.25]], False, (16, 0)),  # straight across, 8 m at two points a metre
+        ([[20.25, -6.25], [20.25, 6.25]], True, (16, 0)),  # beside the stripes
+        ([[10.25, -6.25], [10.25, 6.25]], True, (0, 16)),
+        ([[14.25, 0.25], [34.25, 0.25]], False, (41, 0)),  # along the street
+        ([[14.25, 6.25], [34.25, 6.25]], False, (0, 0)),
+        ([[-6.25, -6.25], [6.25, 6.25]], False, (16, 0)),  # over the junction from corner to corner
+    ]:  # fmt: skip
+        start, goal = np.array(way)
+        length = np.abs(goal - start).max()
+        places = start + np.linspace(0, 1, int(2 * length) + 1)[:, None] * (goal - start)
+        walk = PedestrianTrajectory(
+            "p", places, np.arange(len(places)) * 0.5, np.pad(places, ((0, 0), (0, 1))), np.ones(len(places))
+        )
+        ground = walkable_ground(street(marked=marked).box_map(), KERB_CFG)
+        assert count_on_road(walk, ground.footing, ground.grid) == counts
 
 
 def shares(cfg: RunConfig, name: str) -> tuple[float, float]:

@@ -42,26 +42,26 @@ def random_map(seed: int, count: int, size_m: float = 30.0) -> BoxMap:
     return make_box_map(centers, rng.uniform(0.2, 3.0, (count, 3)), rotations, kinds, ids)
 
 
-@pytest.mark.parametrize(("kind", "gap", "count"), [
-    ("Vegetation", (2.0, 0, 0), 1),  # a gap equal to the threshold counts
-    ("Vegetation", (2.001, 0, 0), 2),
-    ("Vegetation", (0, 0, 2.5), 2),  # every axis must be near
-    ("Vegetation", (-0.5, -0.5, -0.5), 1),  # overlap
-    ("Buildings", (5.0, 0, 0), 1),
-    ("Buildings", (5.0, 5.1, 0), 2),
-    ("Static", (0.0, 0, 0), 2),  # not merged by default
-    ("Buildings Vegetation", (0.0, 0, 0), 2),  # of two kinds
-])  # fmt: skip
-def test_merge_follows_the_gap_rule(kind, gap, count):
-    shift = np.where(np.array(gap) == 0, 0.0, 1.0 + np.array(gap))
-    kinds = kind.split()
-    pair = box_map((kinds[0], (0, 0, 0), (1, 1, 1)), (kinds[-1], shift, shift + 1))
-    merged = simplify(pair, only("merge", min_fill=0.0, min_canopy_fill=0.0))
-    assert len(merged) == count
-    if count == 1:
-        assert merged.ids.tolist() == [1]
-        np.testing.assert_allclose(merged.mins[0], np.minimum(0, shift))
-        np.testing.assert_allclose(merged.maxs[0], np.maximum(1, shift + 1))
+def test_merge_follows_the_gap_rule():
+    for kind, gap, count in [
+        ("Vegetation", (2.0, 0, 0), 1),  # a gap equal to the threshold counts
+        ("Vegetation", (2.001, 0, 0), 2),
+        ("Vegetation", (0, 0, 2.5), 2),  # every axis must be near
+        ("Vegetation", (-0.5, -0.5, -0.5), 1),  # overlap
+        ("Buildings", (5.0, 0, 0), 1),
+        ("Buildings", (5.0, 5.1, 0), 2),
+        ("Static", (0.0, 0, 0), 2),  # not merged by default
+        ("Buildings Vegetation", (0.0, 0, 0), 2),  # of two kinds
+    ]:  # fmt: skip
+        shift = np.where(np.array(gap) == 0, 0.0, 1.0 + np.array(gap))
+        kinds = kind.split()
+        pair = box_map((kinds[0], (0, 0, 0), (1, 1, 1)), (kinds[-1], shift, shift + 1))
+        merged = simplify(pair, only("merge", min_fill=0.0, min_canopy_fill=0.0))
+        assert len(merged) == count
+        if count == 1:
+            assert merged.ids.tolist() == [1]
+            np.testing.assert_allclose(merged.mins[0], np.minimum(0, shift))
+            np.testing.assert_allclose(merged.maxs[0], np.maximum(1, shift + 1))
 
 
 def slow_clusters(mins, maxs, gap_m):

@@ -252,13 +252,11 @@ def run(four_walks: Path, out: Path, **settings: object) -> Path:
     return dual_track.run(DualTrackConfig.model_validate(settings), [four_walks], out)
 
 
-@pytest.mark.parametrize(
-    ("num_frames", "expected"), [(9, []), (10, [0]), (12, [0]), (13, [0, 3]), (170, 54), (200, 64)]
-)
-def test_the_papers_windows(num_frames, expected):
+def test_the_papers_windows():
     """Windows of 10 frames, one every 3: (N - 10) / 3 + 1, which the paper calls 50 to 60 of 170 to 200 frames."""
-    found = list(windows_of(num_frames, DualTrackConfig()))
-    assert (len(found) if isinstance(expected, int) else found) == expected
+    for num_frames, expected in [(9, []), (10, [0]), (12, [0]), (13, [0, 3]), (170, 54), (200, 64)]:
+        found = list(windows_of(num_frames, DualTrackConfig()))
+        assert (len(found) if isinstance(expected, int) else found) == expected
 
 
 def test_a_window_holds_both_tracks_frame_by_frame(four_walks, windows_of_tracks):

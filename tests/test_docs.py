@@ -99,17 +99,18 @@ def test_the_folders_of_the_extending_page_are_the_disk():
     assert sorted(told) == sorted(disk - {"cosfly"})
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_paths_exist(page):
-    text = page.read_text(encoding="utf-8")
-    words = set(
-        re.findall(
-            rf"(?<![\w./-])(?:{'|'.join((*FOLDERS, 'docs'))})/[\w./-]*(?:\.(?:py|glsl|txt|md|yaml)\b|/(?![\w<*]))", text
+def test_paths_exist():
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        words = set(
+            re.findall(
+                rf"(?<![\w./-])(?:{'|'.join((*FOLDERS, 'docs'))})/[\w./-]*(?:\.(?:py|glsl|txt|md|yaml)\b|/(?![\w<*]))",
+                text,
+            )
         )
-    )
-    of_a_run = {"release/dataset/", "caption/answers/"}  # and not of the repository
-    shown = set(re.findall(r"^```python\n# (\S+)$", text, re.MULTILINE))  # files that the page tells to make
-    assert sorted(word for word in words - of_a_run - shown if not (ROOT / word).exists()) == []
+        of_a_run = {"release/dataset/", "caption/answers/"}  # and not of the repository
+        shown = set(re.findall(r"^```python\n# (\S+)$", text, re.MULTILINE))  # files that the page tells to make
+        assert sorted(word for word in words - of_a_run - shown if not (ROOT / word).exists()) == []
 
 
 def test_the_files_page_has_every_column_of_a_release_with_its_fields():
@@ -263,10 +264,11 @@ def test_the_commands_are_found():
     assert any(text.startswith("distill train --dataset work/dataset") for _, text in ALL)
 
 
-@pytest.mark.parametrize(("page", "text"), ALL)
-def test_every_command_parses(page, text):
-    command, words = parsed(text)
-    command.make_context("cosfly", list(words))
+def test_every_command_parses(subtests):
+    for page, text in ALL:
+        with subtests.test(page=page, text=text):
+            command, words = parsed(text)
+            command.make_context("cosfly", list(words))
 
 
 def test_no_option_in_running_text_is_unknown():

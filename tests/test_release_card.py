@@ -85,14 +85,14 @@ def test_values_added_in_pieces_give_the_same_sum(values, cut):
     assert Sum.all([Sum.of(values[:cut]), Sum.of(values[cut:])]) == Sum.of(values)
 
 
-@pytest.mark.parametrize(("forward", "left", "up", "turn", "expected"), [
-    (1.0, 0.2, 0.0, 30.0, "forward"), (-1.0, 0.2, 0.0, 0.0, "backward"), (0.1, -0.4, 0.0, 0.0, "right"),
-    (0.1, 0.2, 0.5, 0.0, "up"), (0.1, 0.1, 0.0, 6.0, "turn left"), (0.0, 0.0, 0.0, -6.0, "turn right"),
-    (0.1, 0.1, 0.0, 2.0, "hover"),
-])  # fmt: skip
-def test_the_class_of_an_action(forward, left, up, turn, expected):
-    action = {"forward_mps": forward, "left_mps": left, "up_mps": up, "yaw_rate_degps": turn}
-    assert action_class(action) == expected
+def test_the_class_of_an_action():
+    for forward, left, up, turn, expected in [
+        (1.0, 0.2, 0.0, 30.0, "forward"), (-1.0, 0.2, 0.0, 0.0, "backward"), (0.1, -0.4, 0.0, 0.0, "right"),
+        (0.1, 0.2, 0.5, 0.0, "up"), (0.1, 0.1, 0.0, 6.0, "turn left"), (0.0, 0.0, 0.0, -6.0, "turn right"),
+        (0.1, 0.1, 0.0, 2.0, "hover"),
+    ]:  # fmt: skip
+        action = {"forward_mps": forward, "left_mps": left, "up_mps": up, "yaw_rate_degps": turn}
+        assert action_class(action) == expected
 
 
 def test_every_snippet_of_the_card_runs(built, tmp_path, monkeypatch):
@@ -141,18 +141,18 @@ def test_the_stride_is_that_of_the_paper(num_points, num_frames):
         assert chosen.tolist() == [k * (num_points - 1) // (num_frames - 1) for k in range(num_frames)]
 
 
-@pytest.mark.parametrize(("num_points", "num_frames", "window", "expected"), [
-    (7, 1, 1, [3]),
-    (0, 3, 5, []),
-    (3, 3, 5, [0, 1, 2]),
-    (3, 9, 5, [0, 1, 2]),
-    (12, 8, 5, [2, 3, 4, 5, 6, 7, 8, 9]),  # one run, in the middle
-    (20, 12, 2, [0, 1, 2, 3, 4, 5, 14, 15, 16, 17, 18, 19]),  # two runs of six
-    (20, 13, 2, [0, 1, 2, 3, 4, 5, 13, 14, 15, 16, 17, 18, 19]),
-])  # fmt: skip
-def test_by_hand(num_points, num_frames, window, expected):
-    selection = "stride" if window == 1 else "windows"
-    assert select_frames(num_points, num_frames, selection, window).tolist() == expected
+def test_by_hand():
+    for num_points, num_frames, window, expected in [
+        (7, 1, 1, [3]),
+        (0, 3, 5, []),
+        (3, 3, 5, [0, 1, 2]),
+        (3, 9, 5, [0, 1, 2]),
+        (12, 8, 5, [2, 3, 4, 5, 6, 7, 8, 9]),  # one run, in the middle
+        (20, 12, 2, [0, 1, 2, 3, 4, 5, 14, 15, 16, 17, 18, 19]),  # two runs of six
+        (20, 13, 2, [0, 1, 2, 3, 4, 5, 13, 14, 15, 16, 17, 18, 19]),
+    ]:  # fmt: skip
+        selection = "stride" if window == 1 else "windows"
+        assert select_frames(num_points, num_frames, selection, window).tolist() == expected
 
 
 def test_the_coordinates_state_the_constants_of_the_code():
