@@ -438,18 +438,22 @@ def test_a_defect_is_found(defect, name, state, words):
     assert words in findings[name].detail
 
 
-def test_a_slow_answer_to_the_largest_prompt_is_no_matter_of_the_context():
+@pytest.mark.parametrize(("only_with_schema", "words"), [
+    (False, r"at [\d.]+ tokens/s.* 1024 tokens take \d+ s; set caption.endpoint.timeout_s=\d+,"),
+    (True, r"one within \d s without a JSON schema: set caption.endpoint.json_schema=false"),
+])  # fmt: skip
+def test_a_slow_answer_to_the_largest_prompt_is_no_matter_of_the_context(only_with_schema, words):
     slow = raw(HEAD, b"X: y\r\n", pause_s=0.02, is_endless=True)
     sound = patient()
-    findings = examine(
-        lambda body: (slow if body["messages"][0]["role"] == "system" else sound)(body),
-        image={"modalities": []}, endpoint={"timeout_s": IMPATIENT["timeout_s"]},
-    )  # fmt: skip
+
+    def respond(body: dict) -> tuple[int, dict]:
+        is_largest = body["messages"][0]["role"] == "system"
+        return (slow if is_largest and ("response_format" in body or not only_with_schema) else sound)(body)
+
+    findings = examine(respond, image={"modalities": []}, endpoint={"timeout_s": IMPATIENT["timeout_s"]})
     assert list(findings) == ["model", "answers", "thinking", "JSON schema", "speed"]
     assert findings["speed"].state == "unusable"
-    assert re.search(
-        r"at [\d.]+ tokens/s.* 1024 tokens take \d+ s; set caption.endpoint.timeout_s=\d+,", findings["speed"].detail
-    )
+    assert re.search(words, findings["speed"].detail)
 
 
 @pytest.mark.parametrize("defect", [{}, {"refuses_schema": True}], ids=str)  # a refused schema is a request, too

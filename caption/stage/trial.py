@@ -72,8 +72,10 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
         raise TeacherError(what, where=cfg.teacher, got=got)
     for (sample_id, exchanged), outcome in zip(exchanges.items(), outcomes, strict=True):
         yield f"=== {sample_id} ==="
+        before = None
         for number, (request, reply) in enumerate(exchanged, 1):
-            yield from _exchange(number, request, reply)
+            yield from _exchange(number, request, reply, is_same=before == request.messages)
+            before = request.messages
         yield "--- outcome ---"
         yield from _outcome(outcome) if isinstance(outcome, Caption) else [f"no answer: {for_terminal(str(outcome))}"]
 
@@ -82,16 +84,22 @@ def _outcome(caption: Caption) -> Iterator[str]:
     """Yield the lines about a caption: its status, what was checked, and its texts."""
     reason, checks = caption.drop_reason, caption.checks
     yield caption.status if reason is None else f"dropped because of {reason}: {REASONS[reason]}"
-    told = [("label", caption.label), ("verdict", caption.verdict), ("refusal", checks.refusal)]
+    told = [("label", caption.label), ("verdict", caption.verdict)]
+    told += [("structure", checks.structure), ("refusal", checks.refusal)]
     told += [("contradicted", text) for text in checks.contradictions or ()]
     for language, answer in (("en", caption.en), ("zh", caption.zh)):
         told += [(language, text) for text in (answer.model_dump().values() if answer else ())]
     yield from (f"{name}: {for_terminal(text)}" for name, text in told if text is not None)
 
 
-def _exchange(number: int, request: Request, reply: Reply) -> Iterator[str]:
-    """Yield the lines of a question and its answer; a picture is its number and size."""
-    for message in request.messages:
+def _exchange(number: int, request: Request, reply: Reply, *, is_same: bool) -> Iterator[str]:
+    """Yield the lines of a question, if it is not the same as the one before, and its answer.
+
+    A picture is its number and size.
+    """
+    if is_same:
+        yield f"--- request {number}, the same with another seed ---"
+    for message in () if is_same else request.messages:
         yield f"--- request {number}, {message['role']} ---"
         content, num_pictures = message["content"], 0
         parts: list[dict] = [{"type": "text", "text": content}] if isinstance(content, str) else content

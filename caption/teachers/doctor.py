@@ -192,7 +192,7 @@ class _Examination:
         reply = await self._ask(self.largest, limit, answer_schema(more=THEREFORE))
         if isinstance(reply, str):
             if self.seconds >= self.cfg.endpoint.timeout_s:
-                self._report_too_slow()
+                await self._report_too_slow()
             else:
                 self._add("context length", "unusable", f"the largest prompt gets no answer: {reply}")
             return
@@ -208,10 +208,14 @@ class _Examination:
             self._add("context length", "ok", f"{detail}{known}")
         self._report_speed(seconds)
 
-    def _report_too_slow(self) -> None:
+    async def _report_too_slow(self) -> None:
         """Report that the largest prompt gets no answer in time, and what helps."""
         endpoint = self.cfg.endpoint
         detail = f"the largest prompt gets no answer within {endpoint.timeout_s:g} s"
+        if endpoint.json_schema and not isinstance(await self._ask(self.largest, endpoint.max_tokens), str):
+            found = f"but one within {self.seconds:.0f} s without a JSON schema"
+            self._add("speed", "unusable", f"{detail}, {found}: set caption.endpoint.json_schema=false")
+            return
         longer_s = 2 * endpoint.timeout_s
         if self.tokens_per_s:
             answer_s = endpoint.max_tokens / self.tokens_per_s
@@ -220,10 +224,8 @@ class _Examination:
             )
             detail += f" {answer_s:.0f} s"
             longer_s = max(longer_s, 2 * answer_s)  # as much again for the prompt
-        detail += f"; set caption.endpoint.timeout_s={longer_s:.0f}, lower caption.endpoint.max_tokens"
-        if endpoint.json_schema:
-            detail += ", set caption.endpoint.json_schema=false (some servers are slow with a schema)"
-        self._add("speed", "unusable", f"{detail}, or use a faster server or a smaller model")
+        fix = f"set caption.endpoint.timeout_s={longer_s:.0f}, lower caption.endpoint.max_tokens"
+        self._add("speed", "unusable", f"{detail}; {fix}, or use a faster server or a smaller model")
 
     def _report_speed(self, seconds: float) -> None:
         """Report the time of the answer to the largest prompt."""
