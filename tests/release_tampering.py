@@ -18,6 +18,7 @@ from caption.stage.released import read_released
 from cosfly.formats.frames import depth_bytes
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_file
+from cosfly.runtime.json_io import read_json, write_json
 from release import columns
 from release.build.shards import open_writer, points_part
 from release.build.stage import name_shards, write_records
@@ -103,6 +104,18 @@ def _points_of(shards: list[list[Row]], tables: list[list[Row]]) -> list[tuple[R
         tracks[tuple(point[name] for name in columns.PLACE)].append(point)
     of_rows = [(row, tracks[tuple(row[name] for name in columns.PLACE)]) for rows in shards for row in rows]
     return [(row, track[row["frame_index"]], track) for row, track in of_rows]
+
+
+def rewrite(folder: Path, change: Callable[[list[Row]], object]) -> None:
+    """Change rows of a shard, and of what tells of it only its size."""
+    path = next((folder / "data").glob("*.parquet"))
+    table = pq.read_table(path)
+    rows = table.to_pylist()
+    change(rows)
+    pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), path, row_group_size=12)
+    record = read_json(folder / "release.json")
+    next(shard for shard in record["shards"] if shard["path"].endswith(path.name))["bytes"] = path.stat().st_size
+    write_json(folder / "release.json", record)
 
 
 def errors_in(folder: Path, level: str = "pixels", **how: Any) -> dict[str, int]:

@@ -202,6 +202,12 @@ def once(first: Callable[[dict], Sent]) -> Callable[[dict], Sent | None]:
     return respond
 
 
+def cut_after(num_tokens: int) -> Callable[[dict], Sent]:
+    """Answer with nothing but thoughts, to this length."""
+    choice = {"message": {"role": "assistant"}, "finish_reason": "length"}
+    return page(200, json.dumps({"choices": [choice], "usage": USAGE | {"completion_tokens": num_tokens}}))
+
+
 def refuses_system(body: dict) -> Sent | None:
     has_system = body["messages"][0]["role"] == "system"
     return error(400, "System role not supported")({}) if has_system else None
@@ -225,6 +231,8 @@ UNDERSTOOD: dict[str, tuple] = {
     "no system role": (refuses_system, {}, "accepted", ""),
     "refuses all roles": (refuses_roles, {}, "refused", "roles must alternate"),
     "temperature or top_p": (takes_one_sampling_parameter, {"extra_body": {"top_p": None}}, "accepted", ""),
+    "its thoughts use up all tokens": (cut_after(0), {}, "structure", ""),
+    "vLLM: its context is full": (cut_after(7), {}, "context_full", ""),
     "declines": (message(content=None, refusal=DECLINED_WORDS), {}, "declined", DECLINED_WORDS),
 }  # fmt: skip
 

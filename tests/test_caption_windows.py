@@ -151,17 +151,12 @@ def test_facts_of_a_hand_made_window(tree):
     assert (facts.target_turn_deg, facts.box_width_px[2], facts.box_height_px[2]) == (0.0, 20, 60)
     assert (facts.offset_x_px[2:], facts.offset_y_px[2:]) == ((30, None, None), (10, None, None))
     assert facts.visibility == ("visible", "visible", "partly_occluded", "occluded", "out_of_view")
-    prompt = make_question(window, ImageConfig(), "prose", VOCABULARY).prompts["en"].user
-    assert "visible, visible, partly occluded, occluded, out of view\n" in prompt
-    chinese = make_question(window, ImageConfig(), "prose", VOCABULARY).prompts["zh"].user
-    assert "可见, 可见, 被部分遮挡, 被遮挡, 处于视野外\n" in chinese
     # Who is not hidden and cannot be made out is told as that; a tree that does not say so changes nothing.
     dim = dataclasses.replace(window, frames=tuple(dataclasses.replace(f, legible=False) for f in window.frames))
     words = ("illegible", "illegible", "illegible", "occluded", "out_of_view")
     assert measure_facts(dim) == dataclasses.replace(facts, visibility=words)
-    told = make_question(dim, ImageConfig(), "prose", VOCABULARY).prompts
-    assert "hard to make out, hard to make out, hard to make out, occluded, out of view\n" in told["en"].user
-    assert "难以辨认, 难以辨认, 难以辨认, 被遮挡, 处于视野外\n" in told["zh"].user
+    told = make_question(dim, ImageConfig(), "prose", VOCABULARY).prompts["en"].user
+    assert "hard to make out, hard to make out, hard to make out, occluded, out of view\n" in told
     frames = tuple(dataclasses.replace(frame, time_s=0.5 * frame.time_s) for frame in window.frames)
     halved = dataclasses.replace(window, frames=frames)
     doubled = make_question(halved, ImageConfig(), "prose", VOCABULARY).prompts

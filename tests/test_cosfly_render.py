@@ -47,20 +47,18 @@ ALL_MESHES = unit_meshes.all_meshes()
 SMALL = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0, 90.0], "town": "Street", "first_timestamp": 1776000000}
 
 
-def test_instance_ids_are_the_boxes_own_where_they_fit():
-    boxes = make_box_map(np.zeros((3, 3)), np.ones((3, 3)), np.zeros((3, 3)), [3, 9, 1], [5, MAX_BOX_ID, 1])
+def numbered(ids) -> BoxMap:
+    places = np.zeros((len(ids), 3))
+    return make_box_map(places, places + 1.0, places, np.full(len(ids), KINDS["Buildings"]), ids)
+
+
+def test_instance_ids_are_the_boxes_own_where_they_fit_and_leave_those_of_others_free():
+    boxes = numbered([5, MAX_BOX_ID, 1])
     assert (instance_ids(boxes).tolist(), has_own_ids(boxes)) == ([5, MAX_BOX_ID, 1], True)
-    with_zero = make_box_map(np.zeros((2, 3)), np.ones((2, 3)), np.zeros((2, 3)), [3, 3], [0, 1])
-    assert instance_ids(with_zero).tolist() == [1, 2]
-
-
-def test_boxes_leave_the_ids_of_others_free():
-    boxes = make_box_map(np.zeros((2, 3)), np.ones((2, 3)), np.zeros((2, 3)), [3, 9], [MAX_BOX_ID, 7])
+    assert instance_ids(numbered([0, 1])).tolist() == [1, 2]
     assert not has_own_ids(boxes, num_others=1)
-    assert instance_ids(boxes, num_others=1).tolist() == [1, 2]
-    n = MAX_BOX_ID + 5
-    many = make_box_map(np.zeros((n, 3)), np.ones((n, 3)), np.zeros((n, 3)), np.full(n, 3), np.arange(n) + 1)
-    ids = instance_ids(many, num_others=20)
+    assert instance_ids(boxes, num_others=1).tolist() == [1, 2, 3]
+    ids = instance_ids(numbered(np.arange(MAX_BOX_ID + 5) + 1), num_others=20)
     others = [other_id(number) for number in range(20)]
     assert np.isin(ids, [*others, PERSON_ID, 0]).sum() == 0
     assert ids.max() == SHARED_ID

@@ -11,12 +11,12 @@ import tarfile
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from filelock import FileLock
 from public_reader import read_public
-from specimens_release import NUM_POINTS, all_bytes, make_release, rows_by_id
+from release_tampering import rewrite
+from specimens_release import all_bytes, make_release, rows_by_id
 
 import specimens
 from cosfly.formats.playback_file import read_track
@@ -249,23 +249,6 @@ def test_shards_that_escape_or_have_other_names_are_refused(broken, tmp_path, pa
     change_json(broken / "release.json", lambda record: record["shards"][0].update(path=path))
     with pytest.raises(InputError, match="the release is incomplete"):
         export(config("webdataset"), broken, tmp_path / "out")
-
-
-def rewrite(folder: Path, change) -> None:
-    path = next((folder / "data").glob("*.parquet"))
-    table = pq.read_table(path)
-    rows = table.to_pylist()
-    change(rows)
-    pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), path, row_group_size=NUM_POINTS)
-    tell_size(folder, path)
-
-
-def tell_size(folder: Path, path: Path) -> None:
-    def change(record):
-        (shard,) = [shard for shard in record["shards"] if shard["path"].endswith(path.name)]
-        shard["bytes"] = path.stat().st_size
-
-    change_json(folder / "release.json", change)
 
 
 @pytest.mark.parametrize(("change", "words"), [
