@@ -8,6 +8,7 @@ can walk below a tree (`trunk`). The variants of the paper's SimWorld runs (app:
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -267,30 +268,25 @@ def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarra
     split = ground_z_m + cfg.split_z_m
     low, high = box_map.mins[:, 2], box_map.maxs[:, 2]
     is_tall = (box_map.kinds == VEGETATION) & (high - np.maximum(low, ground_z_m) > cfg.adaptive_height_m)
-    rows, keeps, lows, highs = [], list[bool](), [], []
+    pieces = []  # row, low and high end, whether it keeps the id
     for row in np.flatnonzero(is_tall):
         cuts = [float(low[row])]
         if low[row] < split < high[row]:
             cuts.append(split)
         num_pieces = int(np.ceil((high[row] - cuts[-1]) / cfg.adaptive_height_m - 1e-9))
         cuts += np.linspace(cuts[-1], high[row], num_pieces + 1)[1:].tolist()
-        rows += [row] * (len(cuts) - 1)
         has_stem = len(cuts) > 2 and low[row] < split
-        id_piece = 1 if has_stem else 0
-        keeps += [piece == id_piece for piece in range(len(cuts) - 1)]
-        lows += cuts[:-1]
-        highs += cuts[1:]
-    pieces = np.array(rows, dtype=np.int64)
-    is_new = ~np.array(keeps, dtype=bool)
-    low_z, high_z = np.array(lows), np.array(highs)
-    half, turns = _upright(box_map, pieces)
+        pieces += [(row, *ends, number == has_stem) for number, ends in enumerate(pairwise(cuts))]
+    columns = np.array(pieces).reshape(-1, 4).T
+    rows, low_z, high_z, is_new = columns[0].astype(np.int64), columns[1], columns[2], columns[3] == 0
+    half, turns = _upright(box_map, rows)
     is_stem = ((low_z < split) & (low_z <= ground_z_m + 1.0))[:, None]
     half[:, :2] = np.where(is_stem, np.minimum(half[:, :2], cfg.cell_size_m / 2), half[:, :2])
     half[:, 2] = (high_z - low_z) / 2
-    ids = box_map.ids[pieces].copy()
+    ids = box_map.ids[rows].copy()
     ids[is_new] = _free_ids(used_ids, int(is_new.sum()))
-    centers = np.column_stack([box_map.centers[pieces, :2], (low_z + high_z) / 2])
-    cut = BoxMap(centers, half, turns, box_map.kinds[pieces], ids)
+    centers = np.column_stack([box_map.centers[rows, :2], (low_z + high_z) / 2])
+    cut = BoxMap(centers, half, turns, box_map.kinds[rows], ids)
     return box_map.select(~is_tall).joined(cut)
 
 
