@@ -178,12 +178,7 @@ def read_decisions(inspected: Path) -> dict[str, Decision]:
 
 def undecided(inspected: Path) -> list[str]:
     """Return the folders of the tracks in review without a decision."""
-    decisions = read_decisions(inspected)
-    return [folder for folder in _in_review(read_inspection(inspected).flights) if folder not in decisions]
-
-
-def _in_review(tracks: Iterable[TrackInspection]) -> list[str]:
-    return [track.folder for track in tracks if track.result == "review"]
+    return [track.folder for track in read_settled(inspected).flights if track.result == "review"]
 
 
 def how_to_decide(folder: Path) -> str:
@@ -196,13 +191,13 @@ def how_to_decide(folder: Path) -> str:
 
 def summary(inspected: Path) -> str:
     """Return the state of the review in one line, with the names of open tracks."""
-    decisions = read_decisions(inspected)
-    folders = _in_review(read_inspection(inspected).flights)
-    counts = Counter(decisions[folder].verdict if folder in decisions else "open" for folder in folders)
-    text = ", ".join(f"{counts[state]} {state}" for state in ("accepted", "rejected", "open"))
-    waiting = [folder for folder in folders if folder not in decisions]
+    before, after = read_inspection(inspected).flights, read_settled(inspected).flights
+    now = {track.folder: track.result for track in after}
+    counts = Counter(now[track.folder] for track in before if track.result == "review")
+    waiting = undecided(inspected)
+    text = f"{counts.total()} tracks in review: {counts['accepted']} accepted, {counts['rejected']} rejected"
     names = f" ({', '.join(waiting[:3])}{', ...' if len(waiting) > 3 else ''})" if waiting else ""
-    return f"{len(folders)} tracks in review: {text}{names}"
+    return f"{text}, {len(waiting)} open{names}"
 
 
 def read_settled(inspected: Path) -> Inspection:
@@ -233,7 +228,7 @@ def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[D
         track = tracks.get(choice.folder.strip("/"))
         if track is None:
             what = "the inspection file lists no track in this folder"
-            expected = f"the folder of a track, such as {', '.join(_in_review(tracks.values())[:3])}"
+            expected = f"the folder of a track, such as {', '.join(undecided(inspected)[:3])}"
             raise InputError(what, where=inspected, got=choice.folder, expected=expected)
         if track.result == "rejected" and choice.verdict == "accepted":
             raise InputError(

@@ -174,9 +174,7 @@ def read_track(folder: Path) -> Track:
     matrices = np.array([camera.intrinsic if (own := _matrix(point.intrinsic)) is None else own for point in points])
     positions_m, rotations_deg = np.hsplit(mirror_poses(poses), 2)
     return Track(
-        town=place.town,
-        trajectory=place.trajectory,
-        variant=place.variant,
+        **vars(place),
         camera=camera,
         time_s=time_s,
         positions_m=positions_m,

@@ -76,14 +76,7 @@ def compare_views(a: View, b: View, intrinsics_a: np.ndarray, intrinsics_b: np.n
 
 
 def _error_of(errors: np.ndarray) -> float:
-    return median_of(errors) if len(errors) >= LEAST_PLANES else np.nan
-
-
-def median_of(values: np.ndarray) -> float:
-    """Return the median, with NaN as the greatest number; for few it takes a quarter of the time of `np.median`."""
-    middle = len(values) // 2
-    ordered = np.partition(values, (middle - 1, middle))
-    return float(ordered[middle] if len(values) % 2 else (ordered[middle - 1] + ordered[middle]) / 2.0)
+    return float(np.median(errors)) if len(errors) >= LEAST_PLANES else np.nan
 
 
 @njit(cache=True, nogil=True)

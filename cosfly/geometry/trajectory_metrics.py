@@ -93,17 +93,14 @@ def draw_pedestrians(num_walks: int, resamples: int, rng: np.random.Generator) -
 
 
 def figure_of_draws(value: float, drawn: np.ndarray, count: int, num_walks: int, confidence: float) -> Figure:
-    """Return a figure with its interval from the values on the draws, (draws,); NaN: nothing of the kind occurs."""
+    """Return a figure with its interval from the values on the draws, (draws,); NaN: nothing of the kind occurs.
+
+    The interval holds the share `confidence` of the draws; one trajectory has none.
+    """
     if count == 0 or np.isnan(value):
         return Figure(value=None, low=None, high=None, count=count)
-    low, high = interval_of(drawn, confidence) if num_walks > 1 else (None, None)  # one trajectory has no spread
+    known = drawn[~np.isnan(drawn)]
+    if num_walks < 2 or not len(known):
+        return Figure(value=value, low=None, high=None, count=count)
+    low, high = np.quantile(known, [(1 - confidence) / 2, (1 + confidence) / 2]).tolist()
     return Figure(value=value, low=low, high=high, count=count)
-
-
-def interval_of(drawn: np.ndarray, confidence: float) -> tuple[float | None, float | None]:
-    """Return the percentiles between which `confidence` of the samples lies, NaN ignored."""
-    known = drawn[~np.isnan(drawn)]  # NaN: nothing of the kind occurs in the draw
-    if not len(known):
-        return None, None
-    low, high = np.quantile(known, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return float(low), float(high)

@@ -60,7 +60,11 @@ SIZES = ("length_m", "width_m", "height_m", "min_height")  # numbers in metres, 
 OTHERS = ("z_m", "yaw_deg", "building:levels", "building:min_level", "lanes")
 PLACE = ("x_m", "y_m", "length_m", "width_m")  # every table has them; and height_m, except of surfaces
 TYPES = [kind for kind in KINDS if kind != "NONE"]
-TYPE_RULES = read_yaml(Path(__file__).with_name("feature_rules.yaml"))["rules"]
+TYPE_RULES = [  # pattern of the column, geometry, pattern of the value, type
+    (column, rule.get("geometry", ""), value, kind)
+    for rule in read_yaml(Path(__file__).with_name("feature_rules.yaml"))["rules"]
+    for column in rule["column"].split("|") for values, kind in rule["kinds"].items() for value in values.split("|")
+]  # fmt: skip
 GEOMETRIES = ("Point", "LineString", "Polygon", "MultiPoint", "MultiLineString", "MultiPolygon")  # of GeoJSON
 LARGEST_PLACE = 1e8  # absolute value of a coordinate of GeoJSON, in any unit
 MOST_NAME = 40  # characters of a name in messages
@@ -226,28 +230,24 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
 
 def _in_metres(rows: list[_Row], units: Units, path: Path, *, is_table: bool) -> list[_Row]:
     """Return rows with their places in metres, with a problem if they are far from the middle of the others."""
-    places = shapely.get_coordinates([row.shape for row in rows])
+    shapes = np.array([row.shape for row in rows])
+    places = shapely.get_coordinates(shapes)
     if not len(places):
         return rows
     units = _units_of(rows, places, units, path, is_table=is_table)
     project = to_metres(units, places)
     middle = np.median(project(places), axis=0)
-    moved_rows: list[_Row] = []
-    for row in rows:
-        moved = row._replace(shape=shapely.transform(row.shape, project))
+    moved = [row._replace(shape=shape) for row, shape in zip(rows, shapely.transform(shapes, project), strict=True)]
+    for k, row in enumerate(moved):
         z = _number(row.values.get("z_m"))
         if is_table and not math.isnan(z):
-            moved = moved._replace(values={**row.values, "z_m": z * METRES.get(units, 1.0)})
-        farthest_m = float(np.abs(shapely.get_coordinates(moved.shape) - middle).max(initial=0.0))
+            moved[k] = row = row._replace(values={**row.values, "z_m": z * METRES.get(units, 1.0)})
+        farthest_m = float(np.abs(shapely.get_coordinates(row.shape) - middle).max(initial=0.0))
         if farthest_m > WIDEST_M:
-            place = ", ".join(f"{value:.6g}" for value in shapely.get_coordinates(row.shape)[0])
+            place = ", ".join(f"{value:.6g}" for value in shapely.get_coordinates(rows[k].shape)[0])
             problem = f"it is {farthest_m / 1000:,.0f} km from the middle of the map, at {place}"
-            moved = moved._replace(problem=problem, reason="far_away")
-        moved_rows.append(moved)
-    corners = shapely.get_coordinates([row.shape for row in moved_rows if not row.problem])
-    if len(corners):
-        origin_m(corners.min(axis=0), corners.max(axis=0), path)  # refuses a map that is too wide
-    return moved_rows
+            moved[k] = row._replace(problem=problem, reason="far_away")
+    return moved
 
 
 def _units_of(rows: list[_Row], places: np.ndarray, units: Units, path: Path, *, is_table: bool) -> Units:
@@ -389,14 +389,11 @@ def _kind_of(row: _Row, cfg: BoxesConfig) -> str:
         return kind
     if cfg.is_plain:
         raise _Skipped("unknown_type", f"unknown type {name[:40]!r}{nearest(name, [*TYPES, *cfg.types])}")
-    for rule in TYPE_RULES:
-        is_meant = any(fnmatchcase(column, pattern) for pattern in rule["column"].split("|"))
-        if is_meant and rule.get("geometry", "") in row.shape.geom_type:
-            for patterns, kind in rule["kinds"].items():
-                if any(fnmatchcase(name, pattern) for pattern in patterns.split("|")):
-                    if kind in TYPES:
-                        return kind
-                    break
+    for of_column, geometry, pattern, kind in TYPE_RULES:
+        if fnmatchcase(column, of_column) and geometry in row.shape.geom_type and fnmatchcase(name, pattern):
+            if kind in TYPES:
+                return kind
+            break
     if not name:
         own = ", ".join(row.values)[:80] or "none"
         words = f"maps.boxes.type_column names no property of this feature, which has {own}"

@@ -8,7 +8,7 @@ they rise over the ground.
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -63,33 +63,24 @@ class CityJsonConfig(Config):
 Facet = tuple[Polygon, np.ndarray]
 
 
-@dataclass
-class CityBoxes:
-    """The boxes of a city model, and the meshes that are drawn instead of some."""
-
-    boxes: BoxList = field(default_factory=BoxList)
-    mesh_refs: dict[int, MeshRef] = field(default_factory=dict)  # by id of a box
-    meshes: dict[str, np.ndarray] = field(default_factory=dict)  # by id of an object
-
-
 def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     """Read a city model; the seed changes nothing."""
     path = cfg.inputs()["city_model"]
     model = read_model(path, cfg.units, cfg.most_skipped)
     objects, origin = _centred(model.objects, path)
-    city = _boxes_of(_flattened(objects), cfg, model.dropped.counts)
+    boxes, meshes = _boxes_of(_flattened(objects), cfg, model.dropped.counts)
     header = MapHeader(
         name=cfg.name, source=MapSource(tool=cfg.tool, version=f"CityJSON {model.version}", file=path.name),
         licence=cfg.licence, credits=cfg.credits, ground_z_m=0.0,
         offset_m=dict(zip("xyz", origin.tolist(), strict=True)),
         num_objects=model.num_objects, dropped_objects=dict(+model.dropped.counts),
     )  # fmt: skip
-    box_map = replace(city.boxes.box_map(header), meshes=Meshes(city.mesh_refs, made=city.meshes))
+    box_map = replace(boxes.box_map(header), meshes=meshes)
     return with_derived_ground(box_map) if cfg.derive_ground else box_map
 
 
-def _boxes_of(objects: list[CityObject], cfg: CityJsonConfig, dropped: Counter[str]) -> CityBoxes:
-    """Return the boxes of all objects by the forms of their rules: solid, wall, surface, green.
+def _boxes_of(objects: list[CityObject], cfg: CityJsonConfig, dropped: Counter[str]) -> tuple[BoxList, Meshes]:
+    """Return the boxes of all objects by the forms of their rules (solid, wall, surface, green), and their meshes.
 
     An object without a box is counted in `dropped`.
     """
@@ -97,28 +88,28 @@ def _boxes_of(objects: list[CityObject], cfg: CityJsonConfig, dropped: Counter[s
     footprints = {key: united([polygon for polygon, _ in value]) for key, value in facets.items()}
     greens = [item for item in objects if item.rule.form == "green" and facets[item.object_id]]
     cell_m = _canopy_cell_m(greens)
-    city = CityBoxes()
+    boxes, meshes = BoxList(), Meshes()
     for item in objects:
         footprint, kind, form = footprints[item.object_id], item.rule.kind, item.rule.form
-        num_before = len(city.boxes)
+        num_before = len(boxes)
         if form == "solid":
-            _add_solid(city, cfg, item, footprint)
+            _add_solid(boxes, meshes, cfg, item, footprint)
         elif form == "wall":
-            _add_wall(city.boxes, item, footprint)
+            _add_wall(boxes, item, footprint)
         elif kind != "Water":  # all water is added last
-            _add_surface(city.boxes, kind, footprint)
+            _add_surface(boxes, kind, footprint)
             if form == "green" and facets[item.object_id]:
-                _add_trees(city.boxes, item, facets[item.object_id], cell_m)
+                _add_trees(boxes, item, facets[item.object_id], cell_m)
         if kind == "Bridge":
-            _add_surface(city.boxes, "Sidewalks", footprint)  # for pedestrians
-        dropped["no_footprint"] += kind != "Water" and len(city.boxes) == num_before
+            _add_surface(boxes, "Sidewalks", footprint)  # for pedestrians
+        dropped["no_footprint"] += kind != "Water" and len(boxes) == num_before
     water = _open_water(objects, footprints)
-    _add_surface(city.boxes, "Water", water)
+    _add_surface(boxes, "Water", water)
     for item in objects:
         if item.rule.kind == "Water":
             is_open = shapely.intersection(footprints[item.object_id], water).area > MIN_AREA_M2
             dropped["under_other_surfaces"] += not is_open
-    return city
+    return boxes, meshes
 
 
 def _open_water(objects: list[CityObject], footprints: dict[str, Any]) -> Any:
@@ -179,7 +170,7 @@ FOOT_M = 0.01  # vertices this near to the lowest one are the solid's foot
 EDGE_M = 0.05  # parts that only touch a rectangle are not over it
 
 
-def _add_solid(city: CityBoxes, cfg: CityJsonConfig, item: CityObject, footprint: Any) -> None:
+def _add_solid(boxes: BoxList, meshes: Meshes, cfg: CityJsonConfig, item: CityObject, footprint: Any) -> None:
     """Add a solid as upright boxes from the ground (or below it) to its top, and its mesh to draw.
 
     A box is as high as the mesh in it, so that planners know its spires.
@@ -188,17 +179,15 @@ def _add_solid(city: CityBoxes, cfg: CityJsonConfig, item: CityObject, footprint
     bottom_m = min(float(z.min()), 0.0)
     top_m = max(float(z.max()), float(z.min()) + 0.1)
     mesh = solid_mesh(item.detailed, bottom_m) if cfg.solids else None
-    first_row = len(city.boxes)
-    for rectangle in _pieces(
-        city.boxes, footprint, 0.05, min_fill=SOLID_FILL, min_size_m=SOLID_PIECE_M, shares=CUT_SHARES
-    ):
+    first_row = len(boxes)
+    for rectangle in _pieces(boxes, footprint, 0.05, min_fill=SOLID_FILL, min_size_m=SOLID_PIECE_M, shares=CUT_SHARES):
         high_m = max(top_m if mesh is None else _top_within(mesh, rectangle, top_m), bottom_m + 0.1)
-        city.boxes.add(item.rule.kind, rectangle.center, rectangle.size, bottom_m, high_m, rectangle.yaw_deg)
-    rows = range(first_row, len(city.boxes))
+        boxes.add(item.rule.kind, rectangle.center, rectangle.size, bottom_m, high_m, rectangle.yaw_deg)
+    rows = range(first_row, len(boxes))
     if mesh is not None and rows:
-        city.meshes[item.object_id] = mesh
+        meshes.made[item.object_id] = mesh
         ref = MeshRef(file=MESHES_FILE, node=item.object_id, fit="world")
-        city.mesh_refs |= {row + 1: ref for row in rows}  # ids are rows counted from 1
+        meshes.refs.update({row + 1: ref for row in rows})  # ids are rows counted from 1
 
 
 def solid_mesh(surfaces: list[Surface], foot_m: float) -> np.ndarray | None:

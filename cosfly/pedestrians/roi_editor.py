@@ -33,12 +33,6 @@ IN_REGION, WALKABLE = (90, 160, 230, 60), (60, 150, 240, 110)  # RGBA over the b
 FROM_ABOVE_PX = 2400
 
 
-def _read_map(path: Path) -> BoxMap:
-    box_map = read_boxes(path)
-    check_ground(box_map, path)
-    return box_map
-
-
 @dataclass
 class Editor:
     """What the page asks for: one map, and one file that it may write.
@@ -157,4 +151,6 @@ def _encoded(picture: np.ndarray) -> str:
 
 def open_editor(map_: Path, cfg: PedestriansConfig, roi: Path, port: int) -> PageServer:
     """Read all that the page shows, and listen; `PageServer.serve` answers until it is interrupted."""
-    return PageServer(Editor(_read_map(map_), cfg, roi, map_), port)
+    box_map = read_boxes(map_)
+    check_ground(box_map, map_)
+    return PageServer(Editor(box_map, cfg, roi, map_), port)

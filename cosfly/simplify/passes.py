@@ -8,13 +8,14 @@ can walk below a tree (`trunk`). The variants of the paper's SimWorld runs (app:
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from typing import ClassVar, Literal
 
 import numpy as np
 import shapely
 from pydantic import Field
 
-from cosfly.formats.boxes import BoxMap, SimplifyPass
+from cosfly.formats.boxes import VECTORS, BoxMap, SimplifyPass
 from cosfly.formats.kinds import KINDS, SURFACE_KINDS
 from cosfly.formats.meshes import Meshes
 from cosfly.geometry.axes import axis_aligned_half_extents, box_corners
@@ -40,39 +41,26 @@ def merge(
         by_center: neighbours are boxes with centres, not faces, within the gap on every axis.
     Source: sec:step2, "Merging adjacent boxes"; by centres: app:simworld:step3; the guard is ours.
     """
-    mins, maxs = box_map.mins, box_map.maxs
-    labels = np.arange(len(box_map))
-    min_fill = np.zeros(len(box_map))
-    split = np.zeros(len(box_map), dtype=bool) if groups is None else groups
+    mins, maxs, groups = box_map.mins, box_map.maxs, np.zeros(len(box_map), dtype=bool) if groups is None else groups
     lows, highs = (box_map.centers, box_map.centers) if by_center else (mins, maxs)
-    for kind, (gap_m, least_share) in sorted(rules.items()):
-        of_kind = box_map.kinds == kind
-        min_fill[of_kind] = least_share
-        for group in np.unique(split[of_kind]):
-            rows = np.flatnonzero(of_kind & (split == group))
-            labels[rows] = rows[clusters(lows[rows], highs[rows], gap_m)]
     half, turns = _upright(box_map, np.arange(len(box_map)))
     footprints = box_corners(box_map.centers, half + CLOSED_GAP_M / 2, np.radians(turns[:, 1]))[:, [0, 2, 6, 4], :2]
-    order = np.argsort(labels, kind="stable")
-    _, starts, sizes = np.unique(labels[order], return_index=True, return_counts=True)
-    for start, size in zip(starts[sizes > 1], sizes[sizes > 1], strict=True):
-        cluster = order[start : start + size]
-        for part in _halved(cluster, box_map.centers, footprints, mins[:, :2], maxs[:, :2], min_fill[cluster[0]]):
-            labels[part] = part.min()
-    order = np.lexsort((box_map.ids, labels))
-    if len(order) == 0:
-        return box_map
-    first = np.flatnonzero(np.r_[True, labels[order][1:] != labels[order][:-1]])
-    leaders = order[first]  # the smallest id of each cluster
-    is_merged = np.diff(np.r_[first, len(order)]) > 1
-    lows, highs = np.minimum.reduceat(mins[order], first), np.maximum.reduceat(maxs[order], first)
-    alone = box_map.select(leaders)
-    merged = is_merged[:, None]
-    centers = np.where(merged, (lows + highs) / 2, alone.centers)
-    half_extents = np.where(merged, (highs - lows) / 2, alone.half_extents)
-    rotations_deg = np.where(merged, 0.0, alone.rotations_deg)
-    result = replace(alone, centers=centers, half_extents=half_extents, rotations_deg=rotations_deg)
-    return result.select(np.argsort(leaders, kind="stable"))  # the order of the input
+    vectors = {name: getattr(box_map, name).copy() for name in VECTORS}
+    keep = np.ones(len(box_map), dtype=bool)
+    for kind, (gap_m, min_fill) in rules.items():
+        for group in np.unique(groups[box_map.kinds == kind]):
+            rows = np.flatnonzero((box_map.kinds == kind) & (groups == group))
+            labels = clusters(lows[rows], highs[rows], gap_m)
+            order = np.argsort(labels, kind="stable")
+            for cluster in np.split(rows[order], np.flatnonzero(np.diff(labels[order])) + 1):
+                for part in _halved(cluster, box_map.centers, footprints, mins, maxs, min_fill):
+                    low, high = mins[part].min(axis=0), maxs[part].max(axis=0)
+                    keep[part] = False
+                    leader = part[np.argmin(box_map.ids[part])]
+                    keep[leader] = True
+                    for values, value in zip(vectors.values(), ((low + high) / 2, (high - low) / 2, 0.0), strict=True):
+                        values[leader] = value
+    return replace(box_map, **vectors).select(keep)
 
 
 def clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:
@@ -101,12 +89,14 @@ def _halved(
     cluster: np.ndarray, centers: np.ndarray, footprints: np.ndarray, mins: np.ndarray, maxs: np.ndarray,
     min_fill: float,
 ) -> Iterator[np.ndarray]:  # fmt: skip
-    """Yield the rows of a cluster in parts that cover at least `min_fill` of the rectangle around them."""
+    """Yield the rows of several boxes of a cluster that cover at least `min_fill` of the rectangle around them."""
     waiting = [cluster]
     while waiting:
         part = waiting.pop()
-        low, high = mins[part].min(axis=0), maxs[part].max(axis=0)
-        if len(part) == 1 or min_fill <= 0.0 or _fill_share(footprints[part], low, high) >= min_fill:
+        if len(part) == 1:
+            continue
+        low, high = mins[part, :2].min(axis=0), maxs[part, :2].max(axis=0)
+        if min_fill <= 0.0 or _fill_share(footprints[part], low, high) >= min_fill:
             yield part
             continue
         axis = int(high[1] - low[1] > high[0] - low[0])
@@ -278,30 +268,25 @@ def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarra
     split = ground_z_m + cfg.split_z_m
     low, high = box_map.mins[:, 2], box_map.maxs[:, 2]
     is_tall = (box_map.kinds == VEGETATION) & (high - np.maximum(low, ground_z_m) > cfg.adaptive_height_m)
-    rows, keeps, lows, highs = [], list[bool](), [], []
+    pieces = []  # row, low and high end, whether it keeps the id
     for row in np.flatnonzero(is_tall):
         cuts = [float(low[row])]
         if low[row] < split < high[row]:
             cuts.append(split)
         num_pieces = int(np.ceil((high[row] - cuts[-1]) / cfg.adaptive_height_m - 1e-9))
         cuts += np.linspace(cuts[-1], high[row], num_pieces + 1)[1:].tolist()
-        rows += [row] * (len(cuts) - 1)
         has_stem = len(cuts) > 2 and low[row] < split
-        id_piece = 1 if has_stem else 0
-        keeps += [piece == id_piece for piece in range(len(cuts) - 1)]
-        lows += cuts[:-1]
-        highs += cuts[1:]
-    pieces = np.array(rows, dtype=np.int64)
-    is_new = ~np.array(keeps, dtype=bool)
-    low_z, high_z = np.array(lows), np.array(highs)
-    half, turns = _upright(box_map, pieces)
+        pieces += [(row, *ends, number == has_stem) for number, ends in enumerate(pairwise(cuts))]
+    columns = np.array(pieces).reshape(-1, 4).T
+    rows, low_z, high_z, is_new = columns[0].astype(np.int64), columns[1], columns[2], columns[3] == 0
+    half, turns = _upright(box_map, rows)
     is_stem = ((low_z < split) & (low_z <= ground_z_m + 1.0))[:, None]
     half[:, :2] = np.where(is_stem, np.minimum(half[:, :2], cfg.cell_size_m / 2), half[:, :2])
     half[:, 2] = (high_z - low_z) / 2
-    ids = box_map.ids[pieces].copy()
+    ids = box_map.ids[rows].copy()
     ids[is_new] = _free_ids(used_ids, int(is_new.sum()))
-    centers = np.column_stack([box_map.centers[pieces, :2], (low_z + high_z) / 2])
-    cut = BoxMap(centers, half, turns, box_map.kinds[pieces], ids)
+    centers = np.column_stack([box_map.centers[rows, :2], (low_z + high_z) / 2])
+    cut = BoxMap(centers, half, turns, box_map.kinds[rows], ids)
     return box_map.select(~is_tall).joined(cut)
 
 
@@ -338,7 +323,6 @@ def prune_nested(box_map: BoxMap, tolerance_m: float) -> BoxMap:
     Inside means: all corners of the axis-aligned bounds in the other box as it is turned. For unturned boxes that is
     the paper's rule (sec:step2); for turned ones it never drops a box that sticks out of a turned one's empty corners.
     """
-    keep = np.ones(len(box_map), dtype=bool)
     mins, maxs = box_map.mins, box_map.maxs
     # Bigger first, then the smaller id: a total order, so that two boxes can never drop each other.
     rank = np.empty(len(box_map), dtype=np.int64)
@@ -346,19 +330,18 @@ def prune_nested(box_map: BoxMap, tolerance_m: float) -> BoxMap:
     is_tilted = (box_map.rotations_deg[:, [0, 2]] != 0).any(axis=1)
     yaw = np.radians(box_map.rotations_deg[:, 1])
     most_m = tolerance_m + 1e-9
-    for kind in np.unique(box_map.kinds):
-        rows = np.flatnonzero(box_map.kinds == kind)
-        inner, outer = (rows[pairs] for pairs in _near_pairs(mins[rows], maxs[rows], most_m))
-        may_hold = (rank[outer] < rank[inner]) & ~is_tilted[outer]
-        may_hold &= ((mins[inner] >= mins[outer] - most_m) & (maxs[inner] <= maxs[outer] + most_m)).all(axis=1)
-        inner, outer = inner[may_hold], outer[may_hold]
-        is_inside = np.ones(len(inner), dtype=bool)
-        cos, sin = np.cos(yaw[outer]), np.sin(yaw[outer])
-        half = box_map.half_extents[outer] + most_m
-        for x in (mins[inner, 0], maxs[inner, 0]):
-            for y in (mins[inner, 1], maxs[inner, 1]):
-                dx, dy = x - box_map.centers[outer, 0], y - box_map.centers[outer, 1]
-                is_inside &= np.abs(dx * cos + dy * sin) <= half[:, 0]
-                is_inside &= np.abs(dy * cos - dx * sin) <= half[:, 1]
-        keep[inner[is_inside]] = False
+    inner, outer = _near_pairs(mins, maxs, most_m)
+    may_hold = (rank[outer] < rank[inner]) & ~is_tilted[outer] & (box_map.kinds[inner] == box_map.kinds[outer])
+    may_hold &= ((mins[inner] >= mins[outer] - most_m) & (maxs[inner] <= maxs[outer] + most_m)).all(axis=1)
+    inner, outer = inner[may_hold], outer[may_hold]
+    is_inside = np.ones(len(inner), dtype=bool)
+    cos, sin = np.cos(yaw[outer]), np.sin(yaw[outer])
+    half = box_map.half_extents[outer] + most_m
+    for x in (mins[inner, 0], maxs[inner, 0]):
+        for y in (mins[inner, 1], maxs[inner, 1]):
+            dx, dy = x - box_map.centers[outer, 0], y - box_map.centers[outer, 1]
+            is_inside &= np.abs(dx * cos + dy * sin) <= half[:, 0]
+            is_inside &= np.abs(dy * cos - dx * sin) <= half[:, 1]
+    keep = np.ones(len(box_map), dtype=bool)
+    keep[inner[is_inside]] = False
     return box_map.select(keep)
