@@ -217,7 +217,9 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
     for note, places in notes.items():
         log.warning("%s: %s", path.name, listed(places, note))
     if sources["levels"] or sources["default"]:
-        log.warning("%s: the sizes of boxes come from: %s", path.name, counts_text(sources))
+        given = {name: count for name, count in sources.items() if name != "file"}
+        words = "%s: the file gives no size of %d of %d boxes: %s"
+        log.warning(words, path.name, sum(given.values()), sources.total(), counts_text(given))
     header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows))
     update: dict[str, Any] = {"dropped_objects": dict(dropped.counts)} if dropped.counts else {}
     if set(sources) != {"file"}:

@@ -210,7 +210,7 @@ def run(
         write_json(out / "pedestrians_report.json", summary)
         share = summary["total"]["on_carriageway_share"]
         log.info(
-            "%.1f %% of the points are on carriageway away from crossings (pedestrians.road_cost above 1 lowers it)",
+            "%.1f %% of the points are on carriageways away from crossings; pedestrians.road_cost above 1 lowers this",
             100 * share,
         )
         write_bytes(out / "paths.png", draw_overview(ground, paths))
