@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from cosfly.formats.columns import (
     ANGLES,
@@ -25,13 +26,17 @@ from cosfly.formats.columns import (
 )
 from cosfly.formats.pedestrian_paths import PLAIN_PACE, pace_field, pace_of
 from cosfly.formats.segments import Mission, Segment, flown_as_json, read_flown
-from cosfly.runtime.errors import InputError, shown
-from cosfly.runtime.json_io import MISSING, FileFormat, read_object
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.json_io import MISSING, FileFormat, read_object, validated
 
 TRACE_FORMAT = FileFormat("cosfly.drone_trace", "1.0", "drone traces")
 ARRAYS = ("time_s", "positions_m", "rotations_deg", "targets_m", "visibility")
 UNCHECKED = ("metrics", "solver", "drop_reason", "instead_of", "not_held")
 MOST_TRAJECTORIES = 1_000_000  # of a run
+
+
+class _Part(BaseModel):
+    number: int = Field(strict=True, ge=0, lt=MOST_TRAJECTORIES)
 
 
 @dataclass(frozen=True)
@@ -52,14 +57,8 @@ class Excerpt:
     def from_json(cls, record: Any, where: str) -> Excerpt | None:
         if record is None:
             return None
-        if not isinstance(record, dict) or record.get("number") not in range(MOST_TRAJECTORIES):
-            what = "the field is not a valid record of a part of a trajectory"
-            expected = (
-                f"an object with `id`, `number` (0 to {MOST_TRAJECTORIES - 1}) and `before` (target positions in "
-                "metres before this part)"
-            )
-            raise InputError(what, where=where, got=shown(record), expected=expected)
-        return cls(text_id(record, where), int(record["number"]), column(record, "before", where, None, 3))
+        number = validated(_Part, record, where).number
+        return cls(text_id(record, where), number, column(record, "before", where, None, 3))
 
 
 @dataclass(frozen=True)

@@ -41,11 +41,12 @@ def merge(
         by_center: neighbours are boxes with centres, not faces, within the gap on every axis.
     Source: sec:step2, "Merging adjacent boxes"; by centres: app:simworld:step3; the guard is ours.
     """
-    mins, maxs, groups = box_map.mins, box_map.maxs, np.zeros(len(box_map), dtype=bool) if groups is None else groups
+    mins, maxs = box_map.mins, box_map.maxs
+    groups = np.zeros(len(box_map), dtype=bool) if groups is None else groups
     lows, highs = (box_map.centers, box_map.centers) if by_center else (mins, maxs)
     half, turns = _upright(box_map, np.arange(len(box_map)))
     footprints = box_corners(box_map.centers, half + CLOSED_GAP_M / 2, np.radians(turns[:, 1]))[:, [0, 2, 6, 4], :2]
-    vectors = {name: getattr(box_map, name).copy() for name in VECTORS}
+    centers, half_extents, rotations_deg = (getattr(box_map, name).copy() for name in VECTORS)
     keep = np.ones(len(box_map), dtype=bool)
     for kind, (gap_m, min_fill) in rules.items():
         for group in np.unique(groups[box_map.kinds == kind]):
@@ -55,12 +56,12 @@ def merge(
             for cluster in np.split(rows[order], np.flatnonzero(np.diff(labels[order])) + 1):
                 for part in _halved(cluster, box_map.centers, footprints, mins, maxs, min_fill):
                     low, high = mins[part].min(axis=0), maxs[part].max(axis=0)
-                    keep[part] = False
                     leader = part[np.argmin(box_map.ids[part])]
-                    keep[leader] = True
-                    for values, value in zip(vectors.values(), ((low + high) / 2, (high - low) / 2, 0.0), strict=True):
-                        values[leader] = value
-    return replace(box_map, **vectors).select(keep)
+                    centers[leader], half_extents[leader] = (low + high) / 2, (high - low) / 2
+                    rotations_deg[leader] = 0.0
+                    keep[part] = part == leader
+    merged = replace(box_map, centers=centers, half_extents=half_extents, rotations_deg=rotations_deg)
+    return merged.select(keep)
 
 
 def clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:
