@@ -94,8 +94,7 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
     """Return a map of a server's answers; the header counts dropped objects."""
     sizes = read_sizes(cfg.sizes) if cfg.sizes else {}
     dropped = Counter[str]()
-    rows: list[np.ndarray] = []
-    kinds: list[int] = []
+    rows: list[np.ndarray] = []  # centre, half sizes, rotation and kind
     used: list[tuple[str, str, str]] = []  # name, class, and source of the size
     for item in objects:
         kind = kind_of(item.class_name)
@@ -104,8 +103,7 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
             dropped[reason] += 1
             continue
         assert box is not None
-        rows.append(box)
-        kinds.append(KINDS[kind or "Other"])
+        rows.append(np.append(box, KINDS[kind or "Other"]))
         used.append((item.name, item.class_name, source))
     sources = [source for _, _, source in used]
     counts = {source: sources.count(source) for source in SOURCES}
@@ -115,9 +113,9 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
         num_objects=len(objects), dropped_objects=dict(dropped),
     )  # fmt: skip
     log.info("%s: sources of sizes: %s", where, counts_text(counts))
-    boxes = np.reshape(rows, (-1, 9))
+    centers, half_extents, turns, kinds = np.split(np.reshape(rows, (-1, 10)), [3, 6, 9], axis=1)
     ids = [id_of(name) for name, _, _ in used]
-    box_map = make_box_map(boxes[:, :3], boxes[:, 3:6], boxes[:, 6:], kinds, ids, header)
+    box_map = make_box_map(centers, half_extents, turns, kinds, ids, header)
     fix = "load another level, or add a table with the sizes of the assets to maps.unrealcv.sizes"
     box_map = served(box_map, cfg.ground_z_m, np.array(sources) == "road", where, fix)
     return LevelMap(**vars(box_map), objects=tuple(used))
