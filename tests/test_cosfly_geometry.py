@@ -139,12 +139,16 @@ def test_only_boxes_at_a_persons_height_block():
 
 
 @settings(max_examples=60)
-@given(st.floats(-3, 15), st.floats(-3, 15), st.floats(0.05, 6), st.floats(0.05, 6), st.floats(-180, 180))
-def test_turned_boxes_fill_the_cells_that_shapely_finds(x, y, half_x, half_y, yaw_deg):
-    grid = occupancy(one_box((x, y, 1), (half_x, half_y, 1), (0, yaw_deg, 0)), like=free_grid(12, 12))
-    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * [half_x, half_y]
-    turn = rotation_matrix(0.0, np.radians(yaw_deg), 0.0)[:2, :2]
-    footprint = shapely.Polygon(corners @ turn.T + [x, y])
+@given(
+    st.floats(-3, 15), st.floats(-3, 15), st.floats(0.05, 6), st.floats(0.05, 6), st.floats(-180, 180),
+    st.sampled_from([0.0, 25.0]),
+)  # fmt: skip
+def test_turned_boxes_fill_the_cells_that_shapely_finds(x, y, half_x, half_y, yaw_deg, tilt_deg):
+    turn_deg = tilt_deg, yaw_deg, -tilt_deg
+    grid = occupancy(one_box((x, y, 1), (half_x, half_y, 1), turn_deg), like=free_grid(12, 12))
+    corners = np.array(list(itertools.product((-1, 1), repeat=3))) * [half_x, half_y, 1]
+    turned = corners @ rotation_matrix(*np.radians(turn_deg)).T + [x, y, 1]
+    footprint = shapely.MultiPoint(turned[:, :2]).convex_hull  # what the box covers, seen from above
     for row, column in itertools.product(range(12), range(12)):
         cell = shapely.box(column, row, column + 1, row + 1)
         # Within twice the tolerance of a mere touch both answers are right.
