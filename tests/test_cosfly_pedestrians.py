@@ -227,26 +227,6 @@ def test_others_round_trip_and_bad_files(tmp_path):
         read_bystanders(path)
 
 
-KERB_CFG = PedestriansConfig(road_cost=20, min_component_cells=100, min_distance_m=20)
-
-
-def street(*, marked: bool = False, reach_m: float = 40.0) -> BoxList:
-    """Two streets of 8 m that cross at the origin, between pavements of 4 m, on a lawn; one has dashes."""
-    boxes, middle_m, length_m = BoxList(), (reach_m + 4) / 2, reach_m - 4
-    boxes.span("Terrain", (-reach_m, -reach_m), (reach_m, reach_m), -0.4, -0.1)
-    for size in (2 * reach_m, 8), (8, 2 * reach_m):
-        boxes.add("Roads", (0, 0), size, -0.36, -0.06)
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            boxes.add("Sidewalks", (sx * middle_m, sy * 6), (length_m, 4), -0.3, 0.0)
-            boxes.add("Sidewalks", (sx * 6, sy * middle_m), (4, length_m), -0.3, 0.0)
-    for x in (16, 22, 28):
-        boxes.add("RoadLines", (x, 0), (3.0, 0.16), -0.1, -0.03)
-    for y in np.arange(-3.2, 3.4, 1.2) if marked else ():
-        boxes.add("RoadLines", (10, y), (3.0, 0.55), -0.1, -0.03)
-    return boxes
-
-
 CFG = PedestriansConfig(others=6, look_alikes=2, pace={"walk": 1, "stop_and_look": 1, "turn_back": 1})
 
 
@@ -313,6 +293,26 @@ def test_the_stage_writes_others_only_where_they_are_wanted(tmp_path: Path, capl
         np.testing.assert_array_equal(before.positions_m, walk.positions_m)
     counts = json.loads((tmp_path / "one/pedestrians_report.json").read_text())["others"]
     assert counts == {"wanted": 9, "placed": sum(len(bystanders.others) for bystanders in companions)}
+
+
+KERB_CFG = PedestriansConfig(road_cost=20, min_component_cells=100, min_distance_m=20)
+
+
+def street(*, marked: bool = False, reach_m: float = 40.0) -> BoxList:
+    """Two streets of 8 m that cross at the origin, between pavements of 4 m, on a lawn; one has dashes."""
+    boxes, middle_m, length_m = BoxList(), (reach_m + 4) / 2, reach_m - 4
+    boxes.span("Terrain", (-reach_m, -reach_m), (reach_m, reach_m), -0.4, -0.1)
+    for size in (2 * reach_m, 8), (8, 2 * reach_m):
+        boxes.add("Roads", (0, 0), size, -0.36, -0.06)
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            boxes.add("Sidewalks", (sx * middle_m, sy * 6), (length_m, 4), -0.3, 0.0)
+            boxes.add("Sidewalks", (sx * 6, sy * middle_m), (4, length_m), -0.3, 0.0)
+    for x in (16, 22, 28):
+        boxes.add("RoadLines", (x, 0), (3.0, 0.16), -0.1, -0.03)
+    for y in np.arange(-3.2, 3.4, 1.2) if marked else ():
+        boxes.add("RoadLines", (10, y), (3.0, 0.55), -0.1, -0.03)
+    return boxes
 
 
 @pytest.mark.parametrize(("way", "marked", "counts"), [
