@@ -20,6 +20,13 @@ def invoke(*words: object) -> Result:
     return CliRunner().invoke(app, line)
 
 
+def obeyed(*words: object) -> str:
+    """Run a command that has to succeed; give what it printed."""
+    result = invoke(*words)
+    assert result.exit_code == 0, (words, result.output, result.exception)
+    return result.output
+
+
 @contextlib.contextmanager
 def working_here() -> Iterator[None]:
     """Work on items in this process, since each worker takes seconds to begin."""

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map
 from cosfly.formats.frames import (
     SKY_DEPTH_M,
     Camera,
@@ -45,6 +46,13 @@ class Scene:
     colors: np.ndarray
     kinds: np.ndarray
     ids: np.ndarray
+
+
+def map_of(*rows: tuple, ids: Any = None, **header: Any) -> BoxMap:
+    """Make a map of boxes: kind, centre, half extents and, where one is turned, its yaw in degrees."""
+    turns = [(0.0, row[3] if len(row) > 3 else 0.0, 0.0) for row in rows]
+    kinds = [KINDS[row[0]] for row in rows]
+    return make_box_map([row[1] for row in rows], [row[2] for row in rows], turns, kinds, ids, MapHeader(**header))
 
 
 def make_playback_tree(

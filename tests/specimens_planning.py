@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
-from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
-from cosfly.formats.kinds import KINDS
+from cosfly.formats.boxes import BoxMap, write_boxes
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory, write_paths
 from cosfly.geometry import kernels
 from cosfly.geometry.axes import DT_S
 from cosfly.planners.contract import PlanConfig, TrackingReference
 from cosfly.planners.muco.loss import evaluate, make_state
 from cosfly.planners.stage import make_scenario
+from specimens import map_of
 
 
 def walk_along(path_id, corners, speed_mps=1.2, dt_s=DT_S):
@@ -28,12 +28,7 @@ def walk_along(path_id, corners, speed_mps=1.2, dt_s=DT_S):
 
 def town_of(*rows):
     """(centre, half extents[, yaw_deg]) of buildings, on a large ground slab that must not count as an obstacle."""
-    ground = ((0, 0, -0.5), (500, 500, 0.5), 0)
-    rows = [ground, *((*row, 0) if len(row) == 2 else row for row in rows)]
-    kinds = [KINDS["Ground"]] + [KINDS["Buildings"]] * (len(rows) - 1)
-    return make_box_map(
-        [r[0] for r in rows], [r[1] for r in rows], [(0, r[2], 0) for r in rows], kinds, header=MapHeader(name="hand")
-    )
+    return map_of(("Ground", (0, 0, -0.5), (500, 500, 0.5)), *(("Buildings", *row) for row in rows), name="hand")
 
 
 CANYON = [((x, side * 16, 20), (9, 8, 20)) for x in range(-40, 140, 20) for side in (-1, 1)]

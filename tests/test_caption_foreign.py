@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import invoke
+from commands import invoke, obeyed
 from specimens_captions import VOCABULARY
 from specimens_distill import prepared
 from teacher_server import MODEL, TeacherServer
@@ -119,8 +119,7 @@ def test_from_a_students_answers_to_a_release(tree, rules, tmp_path):
         server.text = lambda body: answers[body["messages"][1]["content"][-1]["text"]]
         cfg = infer.InferConfig(split="train", engine="endpoint")
         infer.run(cfg, taught, [tree], server.url, tmp_path / "infer")
-    result = invoke("caption --teacher", f"student:{tmp_path / 'infer'}", "--data", tree, "--out", tmp_path / "out")
-    assert result.exit_code == 0, result.output
+    obeyed("caption --teacher", f"student:{tmp_path / 'infer'}", "--data", tree, "--out", tmp_path / "out")
     inspected = inspection.run(InspectConfig(), None, None, tree, tmp_path / "inspect")
     source = Source("students", tree, tmp_path / "out/captions.jsonl", inspected)
     folder = package.run(package.ReleaseConfig(licence="mit", pairs="any"), [source], tmp_path / "release")
@@ -203,8 +202,7 @@ def test_unlabelled_flights_are_captioned_and_marked(place, tmp_path):
         tried = invoke([*words, "--out", tmp_path / "out", "--try", "1"])
         assert "--- outcome ---\naccepted" in tried.output
         num_tried = len(server.bodies)
-        result = invoke([*words, "--out", tmp_path / "out"])
-        assert result.exit_code == 0, result.output
+        obeyed([*words, "--out", tmp_path / "out"])
         assert num_tried == 2  # in two languages
         assert len(set(server.bodies)) == len(server.bodies)  # nothing is asked twice
         assert {json.loads(body)["temperature"] for body in server.bodies} == {0.0}

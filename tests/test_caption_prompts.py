@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import invoke
+from commands import invoke, obeyed
 
 from caption.answer_formats.formats import FORMATS, Draft
 from caption.schema import CaptionConfig, ObservedWindow, WindowConfig, observed_frames
@@ -179,12 +179,11 @@ def edit(path: Path, old: str, new: str) -> None:
 
 def test_what_is_exported_is_what_ships(tmp_path):
     folder = tmp_path / "mine"
-    result = invoke("caption prompts --export", folder)
-    assert result.exit_code == 0, result.output
+    obeyed("caption prompts --export", folder)
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == {p.name: p.read_bytes() for p in PROMPTS.glob("*.txt")}
-    assert invoke("caption prompts --check", folder).exit_code == 0
+    obeyed("caption prompts --check", folder)
     (folder / "user_zh.txt").unlink()  # as after a kill
-    assert invoke("caption prompts --export", folder).exit_code == 0
+    obeyed("caption prompts --export", folder)
     for name in ("user_en", "system_zh"):
         edit(folder / f"{name}.txt", "the" if name == "user_en" else "无人机", "2")
     (folder / "user_zh.txt").unlink()

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from commands import invoke
+from commands import invoke, obeyed
 from specimens_planning import CANYON, town_of, walk_along
 from test_cosfly_formats import frame, record
 
@@ -240,8 +240,7 @@ def folder(root, name, seen, *, student=None, **columns):
 
 
 def board(out, *words):
-    done = invoke(f"leaderboard {' '.join(map(str, words))} --out {out}")
-    assert done.exit_code == 0, (done.output, done.exception)
+    obeyed(f"leaderboard {' '.join(map(str, words))} --out {out}")
     return json.loads((out / "leaderboard.json").read_text())["tables"], (out / "leaderboard.html").read_text()
 
 

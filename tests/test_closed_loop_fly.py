@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from commands import invoke, working_here
+from commands import invoke, obeyed, working_here
 from specimens_distill import prepared
 from teacher_server import TeacherServer
 
@@ -49,8 +49,7 @@ def town(built_once) -> Path:
             f"pedestrians {TINY} --workers 1 --map {root}/simplify/step2_simplified.json --out {root}/pedestrians",
         ):
             with working_here():
-                done = invoke(words)
-            assert done.exit_code == 0, done.output
+                obeyed(words)
 
     return built_once("town_to_fly_in", make)
 
@@ -82,8 +81,7 @@ def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(t
         f"--inspect {tmp_path}/inspect/inspect.json --out {tmp_path}/release --set release.licence=cc-by-4.0 "
         "--set release.pairs=any",
     ):
-        done = invoke(words if words.startswith("caption") else words.replace("--seed 4", ""))
-        assert done.exit_code == 0, (words, done.output, done.exception)
+        obeyed(words if words.startswith("caption") else words.replace("--seed 4", ""))
     assert verify(tmp_path / "release/dataset").is_ok
     captions = list(read_captions(tmp_path / "caption/captions.jsonl"))
     assert captions

@@ -31,7 +31,7 @@ from cosfly.geometry.grid import OccupancyGrid, blocks_walking, occupancy, roi_m
 from cosfly.geometry.motion import PlannedMotion
 from cosfly.geometry.reprojection import View, compare_views
 from cosfly.geometry.splits import SPLITS, Course, assign_splits, walks_of
-from specimens import make_flight
+from specimens import make_flight, map_of
 
 angles = st.floats(-180, 180)
 
@@ -159,9 +159,8 @@ def test_turned_boxes_fill_the_cells_that_shapely_finds(x, y, half_x, half_y, ya
 
 
 def test_surfaces_near_the_ground_count_and_a_flyover_does_not():
-    box_map = make_box_map(
-        [[1, 1, -0.1], [3, 1, 6.0], [5, 1, 1.0]], [[1, 1, 0.1]] * 3, np.zeros((3, 3)), [ROADS, ROADS, BUILDINGS]
-    )
+    rows = ("Roads", (1, 1, -0.1)), ("Roads", (3, 1, 6.0)), ("Buildings", (5, 1, 1.0))
+    box_map = map_of(*((*row, (1, 1, 0.1)) for row in rows))
     np.testing.assert_array_equal(surface(box_map, like=free_grid(6, 2)), [[True] * 2 + [False] * 4] * 2)
     assert surface(box_map, [WATER], like=free_grid(6, 2)) is None
 

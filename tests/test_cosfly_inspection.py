@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cosfly.formats.boxes import make_box_map, read_boxes, write_boxes
+from cosfly.formats.boxes import read_boxes, write_boxes
 from cosfly.formats.frames import BystanderMeta, BystandersMeta, depth_file, frame_name, read_depth, read_instance
 from cosfly.formats.inspection import read_inspection
 from cosfly.formats.issues import Report
@@ -28,7 +28,7 @@ from cosfly.inspection.track import check_plan
 from cosfly.runtime.errors import NothingKept
 from cosfly.runtime.io import CHECKSUMS, sha256_file, write_checksums
 from cosfly.runtime.json_io import read_json
-from specimens import change_json, make_playback_tree
+from specimens import change_json, make_playback_tree, map_of
 
 NUM_POINTS = 10
 
@@ -43,10 +43,8 @@ def plan_of(folder: Path) -> DroneTrace:
 
 
 def write_map(workplace: Path, *boxes) -> None:
-    rows = [([0.0, 900.0, -1.0], [9.0, 9.0, 0.1]), *boxes]
-    kinds = [KINDS["Roads"], *[KINDS["Walls"]] * len(boxes)]
-    made = make_box_map([c for c, _ in rows], [h for _, h in rows], np.zeros((len(rows), 3)), kinds)
-    write_boxes(workplace / "map.json", made)
+    road = ("Roads", (0.0, 900.0, -1.0), (9.0, 9.0, 0.1))
+    write_boxes(workplace / "map.json", map_of(road, *(("Walls", *box) for box in boxes)))
 
 
 def list_files(tree: Path) -> None:

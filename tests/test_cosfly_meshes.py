@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
+from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.formats.frames import Look
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.mesh_files import read_meshes, write_meshes
@@ -32,6 +32,7 @@ from cosfly.render.surfaces import solids_of
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import InputError
 from cosfly.simplify.passes import SimplifyConfig, simplify
+from specimens import map_of
 
 SIZE = (320, 180)
 INTRINSIC = intrinsic_matrix(*SIZE, 70.0)
@@ -237,7 +238,7 @@ def test_a_file_may_have_so_many_triangles(tmp_path: Path, monkeypatch: pytest.M
 
 def test_a_box_names_no_file_outside_of_its_folder(tmp_path: Path) -> None:
     path = tmp_path / "boxes_3d.json"
-    write_boxes(path, make_box_map([(0, 0, 1)], [(1, 1, 1)], [(0, 0, 0)], [KINDS["Static"]]))
+    write_boxes(path, map_of(("Static", (0, 0, 1), (1, 1, 1))))
     value = json.loads(path.read_text())
     for name in ("../m.glb", "/m.glb", "a/../../m.glb", "m.fbx", "", "m.glb\0"):
         value["boxes"][0]["mesh"] = {"file": name}
@@ -301,14 +302,10 @@ def scene_map(folder: Path) -> BoxMap:
     house = solid_mesh([[np.array([ROOF[i] for i in ring], dtype=float)] for (ring,) in FACES], 0.0)
     assert house is not None
     write_meshes(folder / "house.glb", {"house": house, "unused": house})
-    rows = [
-        ("Roads", (0, 0, -0.1), (60, 5, 0.1), 0.0, None), ("Buildings", (5, 10, 3.5), (5, 4, 3.5), 0.0, None),
-        ("Buildings", (5, 15, 3.5), (5, 1, 3.5), 0.0, None), ("Static", (-6, 6, 2.0), (3, 1, 2.0), 30.0, None),
-        ("Static", (14, 3, 1.0), (1, 1, 1.0), 0.0, None), ("Walls", (-4, 14, 1), (6, 0.2, 1.0), 5.0, None),
-    ]  # fmt: skip
-    box_map = make_box_map(
-        [row[1] for row in rows], [row[2] for row in rows], [(0.0, row[3], 0.0) for row in rows],
-        [KINDS[row[0]] for row in rows], [7, 40, 41, 9, 300, 12],
+    box_map = map_of(
+        ("Roads", (0, 0, -0.1), (60, 5, 0.1)), ("Buildings", (5, 10, 3.5), (5, 4, 3.5)),
+        ("Buildings", (5, 15, 3.5), (5, 1, 3.5)), ("Static", (-6, 6, 2.0), (3, 1, 2.0), 30.0),
+        ("Static", (14, 3, 1.0), (1, 1, 1.0)), ("Walls", (-4, 14, 1), (6, 0.2, 1.0), 5.0), ids=[7, 40, 41, 9, 300, 12],
     )  # fmt: skip
     world = MeshRef(file="house.glb", node="house", fit="world")
     refs = {40: world, 41: world, 9: MeshRef(file="ball.obj"), 300: MeshRef(file="models/cone.glb")}

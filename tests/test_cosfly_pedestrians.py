@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
+from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.bystanders import Bystander, Bystanders, read_bystanders, write_bystanders
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths
@@ -29,7 +29,7 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import simplify
-from specimens import change_json
+from specimens import change_json, map_of
 
 BUILDINGS, ROADS = KINDS["Buildings"], KINDS["Roads"]
 
@@ -43,9 +43,8 @@ def town():
 
 
 def plain(size_m: float, *walls):
-    centers = [[size_m / 2, size_m / 2, -0.1]] + [center for center, _ in walls]
-    extents = [[size_m / 2, size_m / 2, 0.1]] + [half_extents for _, half_extents in walls]
-    return make_box_map(centers, extents, np.zeros((len(centers), 3)), [ROADS] + [BUILDINGS] * len(walls))
+    half_m = size_m / 2
+    return map_of(("Roads", (half_m, half_m, -0.1), (half_m, half_m, 0.1)), *(("Buildings", *wall) for wall in walls))
 
 
 def ground_in(parts: np.ndarray) -> WalkableGround:
@@ -85,11 +84,8 @@ def test_the_region_of_interest_bounds_every_walk():
 @pytest.mark.parametrize(("ground", "columns"), [("anywhere", 300), ("surfaces", 240), ("paved", 160)])
 def test_people_walk_where_the_settings_say(ground, columns):
     # 80 m of road, 40 m of lawn, 30 m of nothing up to a far wall; boxes of 30 m by 0.2 m.
-    kinds = [ROADS, KINDS["Terrain"], BUILDINGS]
-    box_map = make_box_map(
-        [[40, 50, -0.1], [100, 50, 0.1], [149.95, 50, 5]], [[40, 50, 0.1], [20, 50, 0.1], [0.05, 50, 1]],
-        np.zeros((3, 3)), kinds,
-    )  # fmt: skip
+    road, lawn = ("Roads", (40, 50, -0.1), (40, 50, 0.1)), ("Terrain", (100, 50, 0.1), (20, 50, 0.1))
+    box_map = map_of(road, lawn, ("Buildings", (149.95, 50, 5), (0.05, 50, 1)))
     found = walkable_ground(box_map, PedestriansConfig(ground=ground))
     assert np.count_nonzero(found.parts) == columns * 200
     assert not found.parts[:, columns:].any()
@@ -98,10 +94,8 @@ def test_people_walk_where_the_settings_say(ground, columns):
 def test_walkable_ground_in_small_areas_is_left_out_and_counted(caplog):
     caplog.set_level("INFO")
     # Pavement of 100 m by 100 m, and 50 m away a square of 20 m and one of 10 m.
-    box_map = make_box_map(
-        [[50, 50, -0.1], [160, 50, -0.1], [160, 90, -0.1]], [[50, 50, 0.1], [10, 10, 0.1], [5, 5, 0.1]],
-        np.zeros((3, 3)), [KINDS["Sidewalks"]] * 3,
-    )  # fmt: skip
+    squares = ((50, 50, 50), (160, 50, 10), (160, 90, 5))
+    box_map = map_of(*(("Sidewalks", (x, y, -0.1), (half, half, 0.1)) for x, y, half in squares))
     found = walkable_ground(box_map, PedestriansConfig(safety_radius_m=0))
     assert np.count_nonzero(found.parts) == 200 * 200
     text = "2000 walkable cells in areas below pedestrians.min_component_cells=4000 are not used (areas: 2)"
@@ -205,19 +199,6 @@ def test_simworld_gives_twenty_of_twenty(shared_data, tmp_path):
     assert len(read_boxes(tmp_path / "map.json")) == ground["boxes"]
 
 
-def crossing_town(*more: tuple[str, tuple, tuple]) -> BoxMap:
-    """Two carriageways of 8 m that cross at the origin, pavement all about; more: (kind, center, half_extents)."""
-    rows = [
-        ("Sidewalks", (0, 0, -0.2), (80, 80, 0.15)), ("Roads", (0, 0, -0.1), (80, 4, 0.1)),
-        ("Roads", (0, 42, -0.1), (4, 38, 0.1)), ("Roads", (0, -42, -0.1), (4, 38, 0.1)), *more,
-    ]  # fmt: skip
-    kinds = [KINDS[row[0]] for row in rows]
-    header = MapHeader(name="Crossing")
-    return make_box_map(
-        [row[1] for row in rows], [row[2] for row in rows], np.zeros((len(rows), 3)), kinds, header=header
-    )
-
-
 def test_others_round_trip_and_bad_files(tmp_path):
     path = tmp_path / "others.json"
     walks = Bystander(np.array([[0.0, 0.0, 0.0], [4.0, 3.0, 0.0]]), np.full(2, np.arctan2(3, 4)))
@@ -251,8 +232,10 @@ CFG = PedestriansConfig(others=6, look_alikes=2, pace={"walk": 1, "stop_and_look
 
 @pytest.fixture(scope="module")
 def placed():
-    box_map = crossing_town(("Buildings", (40, 40, 5), (20, 20, 5)), ("Buildings", (-40, 40, 5), (20, 20, 5)))
-    ground = walkable_ground(box_map, CFG)
+    boxes = street(reach_m=80.0)
+    for x in (-40, 40):
+        boxes.add("Buildings", (x, 40), (40, 40), 0.0, 10.0)
+    ground = walkable_ground(boxes.box_map(), CFG)
     made = []
     for k in range(4):
         walk = make_pedestrian(f"p{k}", ground, CFG, rng_for(0, "pedestrians", str(k))).trajectory
@@ -294,7 +277,7 @@ def test_the_same_numbers_give_the_same_company_and_more_keep_the_first(placed):
 
 @pytest.mark.slow
 def test_the_stage_writes_others_only_where_they_are_wanted(tmp_path: Path, caplog):
-    write_boxes(tmp_path / "map.json", crossing_town(("Terrain", (0, 0, -1.0), (90, 90, 0.5))))
+    write_boxes(tmp_path / "map.json", street(reach_m=80.0).box_map())
     plain = PedestriansConfig(num_paths=3)
     run(plain, tmp_path / "map.json", tmp_path / "none")
     assert not (tmp_path / "none/others.json").exists()
@@ -315,16 +298,16 @@ def test_the_stage_writes_others_only_where_they_are_wanted(tmp_path: Path, capl
 KERB_CFG = PedestriansConfig(road_cost=20, min_component_cells=100, min_distance_m=20)
 
 
-def street(*, marked: bool = False) -> BoxList:
-    """Two streets of 8 m that cross at the origin, between pavements of 4 m, on a lawn of 80 m; one has dashes."""
-    boxes = BoxList()
-    boxes.span("Terrain", (-40, -40), (40, 40), -0.4, -0.1)
-    for size in (80, 8), (8, 80):
+def street(*, marked: bool = False, reach_m: float = 40.0) -> BoxList:
+    """Two streets of 8 m that cross at the origin, between pavements of 4 m, on a lawn; one has dashes."""
+    boxes, middle_m, length_m = BoxList(), (reach_m + 4) / 2, reach_m - 4
+    boxes.span("Terrain", (-reach_m, -reach_m), (reach_m, reach_m), -0.4, -0.1)
+    for size in (2 * reach_m, 8), (8, 2 * reach_m):
         boxes.add("Roads", (0, 0), size, -0.36, -0.06)
     for sx in (-1, 1):
         for sy in (-1, 1):
-            boxes.add("Sidewalks", (sx * 22, sy * 6), (36, 4), -0.3, 0.0)
-            boxes.add("Sidewalks", (sx * 6, sy * 22), (4, 36), -0.3, 0.0)
+            boxes.add("Sidewalks", (sx * middle_m, sy * 6), (length_m, 4), -0.3, 0.0)
+            boxes.add("Sidewalks", (sx * 6, sy * middle_m), (4, length_m), -0.3, 0.0)
     for x in (16, 22, 28):
         boxes.add("RoadLines", (x, 0), (3.0, 0.16), -0.1, -0.03)
     for y in np.arange(-3.2, 3.4, 1.2) if marked else ():

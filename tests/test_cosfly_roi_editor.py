@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import Page, browser
-from commands import invoke
+from commands import obeyed
 
-from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
-from cosfly.formats.kinds import KINDS
+from cosfly.formats.boxes import BoxMap, write_boxes
 from cosfly.formats.pedestrian_paths import read_paths
 from cosfly.formats.roi import read_roi
 from cosfly.geometry.grid import roi_mask
 from cosfly.pedestrians.roi_editor import open_editor
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
 from cosfly.viz.page_server import PageServer
+from specimens import map_of
 
 CFG = PedestriansConfig(num_paths=2, min_distance_m=20, max_distance_m=40, min_component_cells=50)
 SQUARE = [[10, 10], [90, 10], [90, 70], [10, 70]]
@@ -27,11 +27,10 @@ SQUARE = [[10, 10], [90, 10], [90, 70], [10, 70]]
 
 def town() -> BoxMap:
     """A square of 120 m x 80 m with a house, a low wall across half of it, and a bin."""
-    rows = [[60, 40, -0.1], [60, 40, 5], [30, 60, 1], [100, 20, 0.5]]
-    halves = [[60, 40, 0.1], [8, 6, 5], [14, 0.3, 1], [0.4, 0.4, 0.5]]
-    kinds = [KINDS[kind] for kind in ("Ground", "Buildings", "Walls", "Static")]
-    turned = [[0, 0, 0], [0, 20, 0], [0, 0, 0], [0, 0, 0]]
-    return make_box_map(rows, halves, turned, kinds, header=MapHeader(name="plaza", ground_z_m=0.0))
+    return map_of(
+        ("Ground", (60, 40, -0.1), (60, 40, 0.1)), ("Buildings", (60, 40, 5), (8, 6, 5), 20.0),
+        ("Walls", (30, 60, 1), (14, 0.3, 1)), ("Static", (100, 20, 0.5), (0.4, 0.4, 0.5)), name="plaza", ground_z_m=0.0,
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -101,10 +100,7 @@ def test_a_polygon_with_a_hole_is_drawn_saved_and_walked_in(map_file, tmp_path):
     assert ((found > 0) == roi_mask(ground.grid, roi)).all()
     assert ((found == found.max()) == ground.walkable).all()
     settings = [f"--set pedestrians.{name}={getattr(CFG, name)}" for name in CFG.model_fields_set]
-    done = invoke(
-        f"pedestrians --map {map_file} --roi {out} --out {tmp_path / 'walks'} --workers 1", " ".join(settings)
-    )
-    assert done.exit_code == 0, done.output
+    obeyed(f"pedestrians --map {map_file} --roi {out} --out {tmp_path / 'walks'} --workers 1", " ".join(settings))
     for walk in read_paths(tmp_path / "walks/path.json"):
         x, y = ground.grid.cells_at(walk.polyline_m).T
         assert ground.is_in_roi[y, x].all()

@@ -13,17 +13,16 @@ from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.formats.kinds import KINDS
 from cosfly.simplify.passes import SimplifyConfig, clusters, crop_below_ground, merge, prune_nested, simplify
 from cosfly.simplify.stage import cross_validate, run
+from specimens import map_of
 
 VEGETATION, BUILDINGS, STATIC, ROADS = (KINDS[name] for name in ("Vegetation", "Buildings", "Static", "Roads"))
 PAPER = {"min_fill": 0.0, "min_canopy_fill": 0.0, "trunk": "full"}
 
 
-def box_map(*rows, ids=None, header=None) -> BoxMap:
+def box_map(*rows, ids=None) -> BoxMap:
     """Rows of kind, low corner, high corner and, optionally, yaw in degrees."""
-    lows, highs = (np.array([row[k] for row in rows], dtype=float) for k in (1, 2))
-    rotations = [[0.0, row[3] if len(row) > 3 else 0.0, 0.0] for row in rows]
-    kinds = [KINDS[row[0]] for row in rows]
-    return make_box_map((lows + highs) / 2, (highs - lows) / 2, rotations, kinds, ids, header)
+    ends = ((kind, np.array(low), np.array(high), yaw) for kind, low, high, *yaw in rows)
+    return map_of(*((kind, (low + high) / 2, (high - low) / 2, *yaw) for kind, low, high, yaw in ends), ids=ids)
 
 
 def only(what: str, **settings_) -> SimplifyConfig:

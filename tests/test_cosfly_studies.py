@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from commands import invoke
+from commands import obeyed
 from test_renderers_contract import circling, write_inputs
 from toy_workers import make_counting_worker, stage_in
 
@@ -68,8 +68,7 @@ def test_the_target_grows_as_the_lens_does(tmp_path_factory, in_this_process):
     words = f"study zoom --map {boxes} --simplified {simplified} --traces {traces} --out {folder / 'out'} --every 2"
     settings = f"render.fovs_deg={LEVELS} render.width_px=640 render.height_px=360".replace(", ", ",")
     sets = [word for setting in settings.split() for word in ("--set", setting)]
-    result = invoke(words, "--workers 0", sets)
-    assert result.exit_code == 0, result.output
+    obeyed(words, "--workers 0", sets)
     out = folder / "out"
     found = json.loads((out / "zoom_study.json").read_text())
     levels = found["levels"]

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from browser import browser
-from commands import invoke
+from commands import invoke, obeyed
 from PIL import Image
 from specimens_captions import VOCABULARY
 from specimens_distill import WINDOW, make_caption
@@ -24,9 +24,8 @@ from caption.stage.window_loop import caption_window
 from caption.stage.windows import cut_windows
 from caption.teachers.prompts import make_question, question_messages
 from caption.teachers.teacher import RuleTeacher, encode_frame
-from cosfly.formats.boxes import make_box_map, write_boxes
+from cosfly.formats.boxes import write_boxes
 from cosfly.formats.captions import PICTURES_MARK, Language, write_captions
-from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.student_chat import encoded_image
@@ -39,7 +38,7 @@ from distill.inference.answers import EngineAnswers
 from distill.inference.samples import InferConfig, Inputs
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample
-from specimens import make_playback_tree
+from specimens import make_playback_tree, map_of
 
 NUM_POINTS = 24
 EVIL = (
@@ -75,9 +74,8 @@ def run_folder(tmp_path_factory) -> Path:
     (folder / "caption").mkdir()
     write_captions(folder / "caption/captions.jsonl", captions)
     (folder / "simplify").mkdir()
-    centers, halves = [[0, 0, 5], [4, 9, 1], [900, 0, 5]], [[5, 5, 5], [2, 1, 1], [5, 5, 5]]
-    town = make_box_map(centers, halves, np.zeros((3, 3)), [KINDS["Buildings"], KINDS["Vegetation"], 3])
-    write_boxes(folder / "simplify/step2_simplified.json", town)
+    houses = (("Buildings", (x, 0, 5), (5, 5, 5)) for x in (0, 900))
+    write_boxes(folder / "simplify/step2_simplified.json", map_of(*houses, ("Vegetation", (4, 9, 1), (2, 1, 1))))
     return folder
 
 
@@ -86,15 +84,16 @@ def page(run_folder, tmp_path_factory) -> Path:
     return run(run_folder, tmp_path_factory.mktemp("page") / "viewer.html", most_frames=12, picture_px=64)
 
 
-def data_of(text: str) -> dict:
+def data_of(page: Path) -> dict:
+    text = page.read_text(encoding="utf-8")
     return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)[1])
 
 
 def test_a_run_is_shown_as_it_is(page):
-    data = data_of(page.read_text(encoding="utf-8"))
+    data = data_of(page)
     assert len(data["flights"]) == 4
     assert {flight["map"] for flight in data["flights"]} == {"one/Town01", "one/Town02"}
-    assert {box["kind"] for box in data["maps"]["one/Town01"]} == {"Buildings", "Vegetation"}  # the third is 900 m away
+    assert {box["kind"] for box in data["maps"]["one/Town01"]} == {"Buildings", "Vegetation"}  # one house is 900 m away
     flight = data["flights"][1]
     found = flight["track"], flight["num_frames"], flight["num_captions"]
     assert found == ("perturbed", NUM_POINTS, 19)
@@ -123,7 +122,7 @@ def test_the_page_asks_for_nothing_and_names_its_script(page):
 
 
 def test_of_many_tracks_whole_trajectories_are_shown(run_folder, tmp_path):
-    two = data_of(run(run_folder, tmp_path / "two.html", most_tracks=2, most_frames=1).read_text(encoding="utf-8"))
+    two = data_of(run(run_folder, tmp_path / "two.html", most_tracks=2, most_frames=1))
     assert len({flight["group"] for flight in two["flights"]}) == 1
     assert [len(flight["frames"]) for flight in two["flights"]] == [1, 1]
     assert any("2 of 4 tracks are shown" in note for note in two["notes"])
@@ -287,11 +286,10 @@ def street_tree(tmp_path_factory) -> Path:
 def test_four_pictures_of_a_frame(street_tree, tmp_path):
     boxes = tmp_path / "boxes_3d.json"
     write_boxes(boxes, street())
-    result = invoke("view", street_tree, "--frame best --out", tmp_path / "a.png", "--map", boxes)
-    assert result.exit_code == 0, result.output
+    result = obeyed("view", street_tree, "--frame best --out", tmp_path / "a.png", "--map", boxes)
     assert Image.open(tmp_path / "a.png").size == (640, 2 * (180 + 36))
     name = four_panels(street_tree, tmp_path / "b.png", box_map=street())
-    assert name in result.output
+    assert name in result
     for frame in (name, str(street_tree / name)):
         assert four_panels(street_tree, tmp_path / "b.png", frame=frame, box_map=street()) == name
     assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), np.asarray(Image.open(tmp_path / "b.png")))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from commands import invoke
+from commands import obeyed
 from pydantic import ValidationError
 from teacher_server import TeacherServer
 
@@ -235,13 +235,11 @@ def test_worlds_go_on_to_releases_with_the_settings_that_are_told(tmp_path, in_t
         "inspect.legible_min=0",
     )
     told = [word for setting in small for word in ("--set", setting)]
-    result = invoke("world", ["a small village"], "--count 2 --seed 5 --out", [tmp_path / "many"])
-    assert result.exit_code == 0, result.output
+    obeyed("world", ["a small village"], "--count 2 --seed 5 --out", [tmp_path / "many"])
     for number in range(2):
         folder = tmp_path / f"many/world_{number:03}"
         run_folder = folder / "run"
-        result = invoke("run", [folder / "loop.yaml", *told], f"--seed {5 + number} --out", [run_folder])
-        assert result.exit_code == 0, result.output
+        obeyed("run", [folder / "loop.yaml", *told], f"--seed {5 + number} --out", [run_folder])
         assert read_manifest(run_folder / "render").counts.kept == 2
         report = read_json(run_folder / "pedestrians/pedestrians_report.json", what="report")
         assert report["total"]["on_carriageway_share"] <= 0.02

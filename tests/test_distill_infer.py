@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from commands import invoke
+from commands import invoke, obeyed
 from PIL import Image
 from specimens_distill import prepared
 from teacher_server import TeacherServer, kept_answers
@@ -73,8 +73,7 @@ def test_one_sample_without_an_answer_costs_no_other(place, tmp_path):
         manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
         assert manifest["counts"]["failed"] == {"http_500": 1}
         assert manifest["counts"]["kept"] == manifest["parsed"] == len(predictions) - 1
-        result = invoke(words)
-        assert result.exit_code == 0, result.output
+        obeyed(words)
         assert len(server.bodies) == num_asked + 1
     assert all(p.coc is not None for p in read_predictions(tmp_path / "out" / "predictions.jsonl"))
 

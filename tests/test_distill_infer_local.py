@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import invoke
+from commands import invoke, obeyed
 from specimens_distill import ADAPTER_PIXELS, make_adapter
 from specimens_students import features_of, make_place
 from teacher_server import kept_answers
@@ -102,8 +102,7 @@ def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
     assert manifest["counts"]["failed"] == {"input": len(hit)}
     assert (tmp_path / "out" / "failures.jsonl").read_text().count("image cannot be decoded") == len(hit)
     (tree / bad).write_bytes(whole)  # mended: those alone are answered
-    result = invoke(words)
-    assert result.exit_code == 0, result.output
+    obeyed(words)
     assert told(read_predictions(tmp_path / "out" / "predictions.jsonl")) == expected
     assert json.loads((tmp_path / "out" / "manifest.json").read_text())["speed"]["answers"] == len(hit)
 

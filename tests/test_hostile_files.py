@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from browser import browser
-from commands import invoke
+from commands import obeyed
 from hypothesis import given
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
@@ -30,6 +30,7 @@ from test_cosfly_answers import TEXT
 from test_cosfly_boxfile import PLAIN, collection, houses
 from test_cosfly_inspection import plan_of
 from test_cosfly_map_kinds import city, node, write_world
+from test_cosfly_viz import data_of
 
 from caption.schema import CaptionConfig
 from caption.stage.ledger import REPORT_FORMAT, CaptionReport, page_html
@@ -61,7 +62,7 @@ from cosfly.runtime.tables import rows_of
 from cosfly.viz.scene_page import run
 from release.card.render import render_card
 from release.record import ReleaseRecord, read_record
-from specimens import make_playback_tree, pack_depth
+from specimens import make_playback_tree, map_of, pack_depth
 
 INPUTS = 40  # for each reader
 LONGEST_LINE = 5_000
@@ -104,10 +105,8 @@ def specimens(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = make_inputs(tmp_path_factory.mktemp("specimens"))
     build(root, root / "release")
     pack_depth(min(root.glob("tree/Town02/*/ORI")))
-    write_boxes(root / "boxes_3d.json", make_box_map(
-        [(0, 14, 8), (20, -9, 1)], [(12, 5, 8), (4, 0.2, 1)], [(0, 0, 0), (0, 30, 0)],
-        [KINDS["Buildings"], KINDS["Walls"]], header=MapHeader(name="street"),
-    ))  # fmt: skip
+    house, wall = ("Buildings", (0, 14, 8), (12, 5, 8)), ("Walls", (20, -9, 1), (4, 0.2, 1), 30.0)
+    write_boxes(root / "boxes_3d.json", map_of(house, wall, name="street"))
     for name, value in (
         ("roi_polygon.json", {"points_world": [[0, 0], [9, 0], [9, 9]], "holes": [[[1, 1], [2, 1], [2, 2]]]}),
         ("city.json", city()),
@@ -376,10 +375,6 @@ def planners(place: Path) -> list[Path]:
     return sorted(place.glob("drone_trace_*.json"))
 
 
-def data_of(page: Path) -> dict:
-    return json.loads(re.search(r'id="data">(.*?)</script>', page.read_text(encoding="utf-8"), re.DOTALL)[1])
-
-
 def floats(text: str, width: int) -> np.ndarray:
     return np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, width)
 
@@ -407,8 +402,7 @@ def test_what_is_packed_is_what_was_read(place, tmp_path):
 @pytest.mark.slow
 def test_the_page_works_offline_in_a_browser(place, tmp_path):
     out, files = tmp_path / "scene.html", " ".join(f"--traces {path}" for path in planners(place))
-    done = invoke(f"view {place / 'map.json'} --out {out} --data {place / 'tree'} {files}")
-    assert done.exit_code == 0, done.output
+    obeyed(f"view {place / 'map.json'} --out {out} --data {place / 'tree'} {files}")
     with browser(tmp_path / "profile") as page:
         page.open(out)
         page.wait("document.body.dataset.ready === 'yes' && document.body.dataset.matrix === 'yes'")

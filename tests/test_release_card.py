@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from commands import invoke
+from commands import obeyed
 from hypothesis import given
 from hypothesis import strategies as st
 from test_cosfly_render import crowded_tree  # noqa: F401
@@ -188,8 +188,7 @@ def test_motion_is_that_of_the_plan_whatever_the_perturbation(seed, num):
 
 
 def test_the_statistics_are_those_of_the_rows(built, tmp_path):
-    result = invoke("release stats", built.parent, "--out", tmp_path)
-    assert result.exit_code == 0, result.output
+    obeyed("release stats", built.parent, "--out", tmp_path)
     written = read_json(tmp_path / "stats.json")["tables"]
     tables = {table["key"]: {row[0]: row[1:] for row in table["rows"]} for table in written}
     numbers = read_json(built / "release.json")["numbers"]

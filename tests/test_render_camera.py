@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from test_renderers_contract import WALKER, circling, opened, pose_towards, street, write_inputs
 
-from cosfly.formats.boxes import MapHeader, make_box_map
 from cosfly.formats.frames import (
     LEGIBLE_CONTRAST,
     TargetMeta,
@@ -200,15 +199,9 @@ def params(weather: str = "clear", time: str = "noon", **knobs: float) -> Weathe
 
 def town():
     """The street of the renderers' tests with lamps along it, a car and a tree."""
-    plain = street()
-    rows = [("Poles", (x, -5.4, 3.0), (1.2, 0.15, 3.0)) for x in (-20.0, 0.0, 20.0)]
-    rows += [("Car", (8.0, -3.0, 0.75), (2.2, 0.9, 0.75)), ("Vegetation", (-4.0, -12.0, 3.0), (2.0, 2.0, 3.0))]
-    centers, halves = ([row[k] for row in rows] for k in (1, 2))
-    return make_box_map(
-        np.vstack([plain.centers, centers]), np.vstack([plain.half_extents, halves]),
-        np.vstack([plain.rotations_deg, np.zeros((len(rows), 3))]), [*plain.kinds, *(KINDS[row[0]] for row in rows)],
-        [*plain.ids, *range(20, 20 + len(rows))], MapHeader(name="street", ground_z_m=0.0),
-    )  # fmt: skip
+    lamps = [("Poles", (x, -5.4, 3.0), (1.2, 0.15, 3.0)) for x in (-20.0, 0.0, 20.0)]
+    car, tree = ("Car", (8.0, -3.0, 0.75), (2.2, 0.9, 0.75)), ("Vegetation", (-4.0, -12.0, 3.0), (2.0, 2.0, 3.0))
+    return street(more=(*lamps, car, tree))
 
 
 POSE = pose_towards((-14.0, -16.0, 8.0), (12.0, 2.0, 2.0))

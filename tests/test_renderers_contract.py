@@ -54,6 +54,7 @@ from cosfly.render.surfaces import layers_of
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import EnvironmentMissing, RenderError
 from cosfly.viz.frame_views import PEDESTRIAN_RGB, read_view
+from specimens import map_of
 
 SIZE = (320, 180)
 DRAWN = {"width_px": 320, "height_px": 180, "fovs_deg": [60.0], "town": "Street", "first_timestamp": 1776000000}
@@ -63,20 +64,17 @@ HIP = np.array([4.0, -3.0, 0.9])
 WALKER = PosedPerson(HIP, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
 
 
-def street(offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> BoxMap:
+def street(offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0), more: tuple[tuple, ...] = ()) -> BoxMap:
     """Kinds that are drawn as their whole box: their depth can be computed. Ids are not in order and not contiguous."""
     rows = [
-        ("Roads", (0, 0, -0.1), (60, 5, 0.1), 0.0), ("Sidewalks", (0, -9, -0.05), (60, 4, 0.15), 0.0),
+        ("Roads", (0, 0, -0.1), (60, 5, 0.1)), ("Sidewalks", (0, -9, -0.05), (60, 4, 0.15)),
         ("Buildings", (10, 14, 6), (8, 5, 6.0), 20.0), ("Buildings", (-14, 16, 4), (6, 6, 4.0), -35.0),
-        ("Walls", (-6, -16, 1), (12, 0.2, 1.0), 5.0), ("Terrain", (0, 40, -0.3), (60, 35, 0.2), 0.0),
+        ("Walls", (-6, -16, 1), (12, 0.2, 1.0), 5.0), ("Terrain", (0, 40, -0.3), (60, 35, 0.2)),
+        *more,
     ]  # fmt: skip
-    ids = [7, 300, 4000, 12, 55, 9]
-    centers = np.array([row[1] for row in rows], dtype=float) + offset_m
-    rotations = [(0.0, row[3], 0.0) for row in rows]
-    return make_box_map(
-        centers, [row[2] for row in rows], rotations, [KINDS[row[0]] for row in rows], ids,
-        MapHeader(name="street", ground_z_m=offset_m[2]),
-    )  # fmt: skip
+    ids = [7, 300, 4000, 12, 55, 9, *range(20, 20 + len(more))]
+    moved = [(kind, np.add(center, offset_m), *rest) for kind, center, *rest in rows]
+    return map_of(*moved, ids=ids, name="street", ground_z_m=offset_m[2])
 
 
 def along_the_pavement(away_m: np.ndarray, path_id: str, drop_reason: str | None = None) -> DroneTrace:
@@ -207,10 +205,8 @@ def test_depth_and_ids_agree_with_computed_rays(renderer, subtests):
 
 
 def test_of_coplanar_surfaces_the_higher_layer_is_seen(renderer_name):
-    kinds = ["Terrain", "Ground", "Roads", "RoadLines", "Sidewalks"]
-    centers = [(2.0 * k, 0.0, -0.1) for k in range(len(kinds))]  # each lies half on the one before
-    halves = [(2.0, 3.0, 0.1)] * len(kinds)
-    box_map = make_box_map(centers, halves, np.zeros((5, 3)), [KINDS[kind] for kind in kinds])
+    kinds = ["Terrain", "Ground", "Roads", "RoadLines", "Sidewalks"]  # each lies half on the one before
+    box_map = map_of(*((kind, (2.0 * k, 0.0, -0.1), (2.0, 3.0, 0.1)) for k, kind in enumerate(kinds)))
     renderer = opened(renderer_name, box_map)
     frame = renderer.render(pose_towards((4.0, -9.0, 8.0), (4.0, 0.0, 0.0)), intrinsic_matrix(*SIZE, 70.0), {})
     renderer.close()
@@ -222,10 +218,9 @@ def test_of_coplanar_surfaces_the_higher_layer_is_seen(renderer_name):
 
 def test_of_coplanar_surfaces_of_one_kind_always_the_same_one_is_seen(renderer_name):
     """Where roads cross at one height, a depth buffer alone lets rounding decide: stripes of both (Z-fighting)."""
-    roads = [KINDS["Roads"]] * 3  # the third, which one of them meets elsewhere, needs no third tier
-    centers = [(0, 0, -0.15), (-5, 0, -0.15), (-5, 40, -0.15)]
-    halves = [(90, 4.5, 0.15), (60, 4, 0.15), (90, 4.5, 0.15)]
-    box_map = make_box_map(centers, halves, [(0, 0, 0), (0, 90, 0), (0, 3, 0)], roads)
+    roads = ("Roads", (0, 0, -0.15), (90, 4.5, 0.15)), ("Roads", (-5, 0, -0.15), (60, 4, 0.15), 90.0)
+    # The third, which one of them meets elsewhere, needs no third tier.
+    box_map = map_of(*roads, ("Roads", (-5, 40, -0.15), (90, 4.5, 0.15), 3.0))
     assert layers_of(box_map).tolist() == [3.0, 3.5, 3.0]
     renderer, seen = opened(renderer_name, box_map), []
     crossing = np.array([[-8.9, -4.4, 0], [-1.1, -4.4, 0], [-1.1, 4.4, 0], [-8.9, 4.4, 0]])
@@ -308,10 +303,9 @@ def test_types_ranges_and_sky(renderer):
 
 
 def test_what_stands_as_far_as_the_sky_is_sky(renderer_name):
-    kinds = ["Terrain", "Roads", "Sidewalks", "Buildings"]
-    centers = [(200.0 * k - 300.0, 700.0, -0.1) for k in range(len(kinds))]
-    halves = [(100.0, 700.0, 0.1)] * 3 + [(100.0, 700.0, 3.0)]
-    box_map = make_box_map(centers, halves, np.zeros((4, 3)), [KINDS[kind] for kind in kinds])
+    heights_m = {"Terrain": 0.1, "Roads": 0.1, "Sidewalks": 0.1, "Buildings": 3.0}
+    rows = enumerate(heights_m.items())
+    box_map = map_of(*((kind, (200.0 * k - 300.0, 700.0, -0.1), (100.0, 700.0, half)) for k, (kind, half) in rows))
     renderer, far = opened(renderer_name, box_map), 0
     for height_m in np.arange(180.0, 320.0, 10.0):
         pose = pose_towards((0.0, 0.0, height_m), (0.0, 990.0, 0.0))
@@ -348,9 +342,7 @@ def test_the_person_is_drawn_in_the_projected_box(renderer):
 
 def test_a_person_under_a_tree_is_seen_from_the_side_and_hidden_from_above(renderer_name):
     hip = np.array([0.0, 0.0, 0.9])
-    trees = make_box_map(
-        [(-1.5, 0.0, 3.0), (1.5, 0.0, 3.0)], [(2.0, 2.0, 3.0)] * 2, np.zeros((2, 3)), [KINDS["Vegetation"]] * 2
-    )
+    trees = map_of(*(("Vegetation", (x, 0.0, 3.0), (2.0, 2.0, 3.0)) for x in (-1.5, 1.5)))
     renderer, camera = opened(renderer_name, trees), Camera(*SIZE, intrinsic_matrix(*SIZE, 40.0))
     walker = replace(WALKER, hip_m=hip)
     seen = {}
@@ -559,7 +551,7 @@ def test_who_stands_before_the_target_hides_it_and_is_told_from_the_map(renderer
 
 
 def test_nobody_else_has_the_ids_of_others(renderer_name):
-    boxes = make_box_map([(0.0, 4.0, 1.0)], [(1.0, 1.0, 1.0)], np.zeros((1, 3)), [KINDS["Buildings"]], [MAX_BOX_ID])
+    boxes = map_of(("Buildings", (0.0, 4.0, 1.0), (1.0, 1.0, 1.0)), ids=[MAX_BOX_ID])
     pose, intrinsic = pose_towards((0.0, -10.0, 3.0), (0.0, 2.0, 1.0)), intrinsic_matrix(*SIZE, 60.0)
     renderer = opened(renderer_name, boxes, num_others=2)
     other = replace(APART, hip_m=np.array([4.0, 0.0, 0.9]))
