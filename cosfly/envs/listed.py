@@ -1,5 +1,6 @@
 """`cosfly fly --env`: a student in a fixed list of episodes, with the records and the score of `cosfly fly`."""
 
+from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
@@ -25,17 +26,18 @@ def run(cfg: ListConfig, out: Path, *, seed: int = 0, workers: int = 1, watch: W
     files = {"controller": CONTROLLER_FILE, "episodes": benchmark.EPISODES_FILE}
     stage = StageFolder.open(out, "fly", config=cfg, inputs={}, seed=seed, package_files=files)
     if not stage.is_complete:
-        flown = [(benchmark.episode_id(*episode), episode, benchmark.NUM_DECISIONS) for episode in episodes]
+        num_decisions = cfg.fly.most_decisions or benchmark.NUM_DECISIONS
+        flown = [(benchmark.episode_id(*episode), episode, num_decisions) for episode in episodes]
         # A model answers all towns as one batch; otherwise a worker opens one town at a time.
         groups = [flown] if cfg.fly.asks_model else [list(own) for _, own in groupby(flown, key=lambda one: one[1][0])]
         num_workers = 1 if cfg.fly.asks_model else workers
-        start = partial(open_towns, task, len(benchmark.HELD_OUT) if cfg.fly.asks_model else 1)
+        start = partial(open_towns, task, len(benchmark.HELD_OUT) if cfg.fly.asks_model else 1, num_decisions)
         fly_episodes(stage, cfg, groups, cfg.fly.batch, start, seed, num_workers, watch, digest)
         finish_episodes(stage, cfg.fly, seed, [name for name, *_ in flown])
     return out
 
 
-def open_towns(task: str, num_open: int) -> EpisodeOpener:
+def open_towns(task: str, num_open: int, num_decisions: int) -> EpisodeOpener:
     """Return the function that opens the episode of a town and trajectory; the last num_open renderers are kept."""
 
     @lru_cache(maxsize=num_open)
@@ -47,6 +49,7 @@ def open_towns(task: str, num_open: int) -> EpisodeOpener:
         episode = benchmark.episode_of(task, benchmark.world_of(benchmark.HELD_OUT[town]), number)
         if episode is None:
             raise InputError(benchmark.UNSUITABLE, where=f"{task}: {town}, pedestrian trajectory {number}")
+        episode = replace(episode, plan=episode.plan.until(episode.num_lead + num_decisions))
         return episode.simulation(airspace_of(town))
 
     return open_episode
