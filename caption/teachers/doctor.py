@@ -234,8 +234,8 @@ class _Examination:
         detail = f"{seconds:.1f} s for one answer to the largest prompt"
         if queued_s > endpoint.timeout_s:
             detail += (
-                "; a run begins with two requests at once and sends more only while answers are quick, since a server with "
-                f"one slot would need {queued_s:.0f} s for caption.endpoint.concurrency={endpoint.concurrency} requests"
+                ". A run begins with 2 requests at once and sends more only while answers are quick: a server with one "
+                f"slot would need {queued_s:.0f} s for caption.endpoint.concurrency={endpoint.concurrency} requests"
             )
         self._add("speed", "ok", detail)
 

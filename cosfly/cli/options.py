@@ -357,7 +357,9 @@ def print_table(
     style = style if head else {"box": None}
     table = Table(title=title, title_justify="left", show_header=bool(head), **style)
     for number, name in enumerate(head):
-        table.add_column(name, justify="right" if number and name not in left else "left", overflow="fold")
+        justify: Any = "right" if number and name not in left else "left"
+        longest = max(map(len, name.split()), default=0)  # a heading breaks at spaces alone
+        table.add_column(name, justify=justify, overflow="fold", min_width=longest)
     for row in rows:
         table.add_row(*row)
     (answer_console if is_answer else console).print(table)

@@ -51,7 +51,8 @@ _tls = functools.cache(httpx.create_ssl_context)  # certificates are read once: 
 
 
 class EndpointConfig(Config):
-    own_names: ClassVar[dict[str, str]] = {}  # settings of teachers in messages -> what they are called here
+    # Settings in messages -> what they are called here.
+    own_names: ClassVar[dict[str, str]] = {" or distill.prepare.modalities=[]": ""}
     model: str | None = Field(None, description="name of the model; empty: the endpoint's only model")
     temperature: float = Field(0.6, ge=0, le=2, description="sampling temperature; 0 is greedy")
     top_p: ClassVar[float] = 0.95  # nucleus sampling; extra_body may set another

@@ -14,7 +14,7 @@ const LABELS = {
       "Space: vertex at the cross; + - zoom; Esc: clear the selection.",
     occupied: "occupied", margin: "safety margin", unused: "free, not used", free: "free", in_region: "in the region", walkable: "walkable", outside: "outside the map", cell: "cell",
     region: "cells in the region", walkable_cells: "walkable cells", components: "components", large: "large enough", largest: "largest", used: "cells used",
-    saved: "saved to", whole: "the whole map: no polygon is closed", few: "a polygon needs three vertices", nowhere: "a hole must begin inside a closed polygon",
+    saved: "saved to", unsaved: "not saved", whole: "the whole map: no polygon is closed", few: "a polygon needs three vertices", nowhere: "a hole must begin inside a closed polygon",
     size: "the mask has a different size", expected: "expected", masked: "mask", same_region: "equal to the region", same_walkable: "equal to walkable cells", here: "only here", there: "only in the mask",
     not_saved: "close the open polygon first", drawing: "click to add vertices, then close the polygon", lost: "the server of the editor does not answer; start the editor again", no_picture: "cannot be read as a picture", large_file: "the file is too large",
   },
@@ -25,7 +25,7 @@ const LABELS = {
     keys: "单击：加顶点；拖动：移动；双击边：插入顶点；滚轮：缩放；右键拖动：平移。按键：方向键移动顶点一格（Shift：十格）或平移；N、B 下一个/上一个顶点；空格：在十字处加顶点；+ - 缩放；Esc：取消选择。",
     occupied: "占用", margin: "安全边距", unused: "空闲但不用", free: "空闲", in_region: "区域内", walkable: "可行走", outside: "地图之外", cell: "栅格",
     region: "区域内栅格", walkable_cells: "可行走栅格", components: "连通块", large: "足够大", largest: "最大", used: "使用的栅格",
-    saved: "已保存到", whole: "整张地图：没有闭合的多边形", few: "多边形至少需要三个顶点", nowhere: "孔洞须从已闭合的多边形内开始",
+    saved: "已保存到", unsaved: "未保存", whole: "整张地图：没有闭合的多边形", few: "多边形至少需要三个顶点", nowhere: "孔洞须从已闭合的多边形内开始",
     size: "掩膜尺寸不同", expected: "应为", masked: "掩膜", same_region: "与区域相同", same_walkable: "与可行走栅格相同", here: "仅此处", there: "仅掩膜",
     not_saved: "请先闭合多边形", drawing: "单击添加顶点，然后闭合多边形", lost: "编辑器服务没有应答：它还在运行吗？", no_picture: "无法作为图片读取", large_file: "文件太大",
   },
@@ -169,7 +169,7 @@ const openFile = (file) => attempt(async () => {  // refused as the pipeline wou
 const save = () => attempt(async () => {
   const roi = toRoi();
   if (openRing() >= 0 || !roi) { tell(roi ? "not_saved" : "whole", "", true); return; }
-  const answer = await (await request("save", JSON.stringify(roi))).json();
+  const answer = await (await request("save", JSON.stringify(roi)).catch((error) => { throw new Error(`${say("unsaved")}: ${error.message}`); })).json();
   tell("saved", answer.saved);
 });
 

@@ -208,11 +208,9 @@ def run(
             outputs.append(out / BYSTANDERS_FILE)
             summary["others"] = _write_bystanders(outputs[-1], [result.bystanders for result in results], header, cfg)
         write_json(out / "pedestrians_report.json", summary)
-        share = summary["total"]["on_carriageway_share"]
-        log.info(
-            "%.1f %% of the points are on carriageways away from crossings; pedestrians.road_cost above 1 lowers this",
-            100 * share,
-        )
+        if share := summary["total"]["on_carriageway_share"]:
+            words = "people are on carriageways, away from crossings, at %.1f %% of the points; "
+            log.info(words + "pedestrians.road_cost=20 prefers pavements", 100 * share)
         write_bytes(out / "paths.png", draw_overview(ground, paths))
     rounded = {step: round(value, 4) for step, value in seconds.items()}
     stage.finish(outputs, finished.tally, ground=ground.counts, total=summary["total"], seconds_by_step=rounded)

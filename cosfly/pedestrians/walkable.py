@@ -288,7 +288,7 @@ def _parts_of_large_components(
     if not is_large.any():
         raise NoPathError(
             "no connected walkable area is large enough", where=error_where,
-            got=f"{int(sizes.max())} cells in the largest of {len(sizes) - 1} areas",
+            got=f"{int(sizes.max())} cells of {cfg.resolution_m:g} m in the largest of {len(sizes) - 1} areas",
             expected=f"at least {cfg.min_component_cells} cells (pedestrians.min_component_cells)",
             fix="lower pedestrians.min_component_cells or pedestrians.safety_radius_m, or widen the region of interest",
         )  # fmt: skip

@@ -188,7 +188,7 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     files = ("trace.json", "plan.json", "layout.json", "placement.json", WORLD_FILE, SIZES_FILE, "checks.json")
     outputs = [out / name for name in (*files, "map.png", LOOP_FILE)]
     stage.finish(outputs, tally, num_boxes=len(town.boxes), is_valid=all(check["is_met"] for check in checks))
-    log.info("make a data set of it with: cosfly run %s", out / LOOP_FILE)
+    log.info("make a data set of it with: cosfly run %s --out %s", out / LOOP_FILE, out / "run")
     return product
 
 
