@@ -249,13 +249,14 @@ def row_lists(shard: Path, columns: Sequence[str], *, strict: bool = True) -> It
 
 
 def _check_values(group: pa.Table, shard: Path) -> None:
+    """Raise InputError if a required column has a null, or a column of numbers one that is not finite."""
     for member in group.schema:
         column = group.column(member.name)
-        wanted = 0 if member.name in REQUIRED else column.null_count
+        most_nulls = 0 if member.name in REQUIRED else column.null_count
         is_struct = pa.types.is_struct(member.type)
         parts = [pc.struct_field(column, i) for i in range(member.type.num_fields)] if is_struct else []
         is_plain = all(pa.types.is_floating(part.type) for part in parts)  # words may be missing
-        if any(part.null_count > wanted for part in (column, *(parts if is_plain else ()))):
+        if any(part.null_count > most_nulls for part in (column, *(parts if is_plain else ()))):
             where, expected = f"{shard}: {member.name}", "a value in every row"
             raise InputError("a required value is missing in a row", where=where, got="null", expected=expected)
         for part in parts or [column]:

@@ -69,8 +69,9 @@ class Asking:
         # An answer that had filled the context, or in which the model declined, is asked for again.
         self.retried = frozenset(self.quarantine) if retry_failed else frozenset[str]()
         self.retried_tracks = {flight_of(sample_id) for sample_id in self.retried}
-        most_in_flight = max(cfg.most_in_flight, cfg.judge.concurrency if cfg.judge.url else 0)
-        self.slots = asyncio.Semaphore(most_in_flight + WAITING_WINDOWS)  # one for each window in work
+        # One slot for each window in work. A window has one request in flight, to the teacher or to the judge.
+        num_asking = max(cfg.most_in_flight, cfg.judge.concurrency if cfg.judge.url else 0)
+        self.slots = asyncio.Semaphore(num_asking + WAITING_WINDOWS)
         self.begun: dict[TrackInput, list[asyncio.Task[Caption | None]]] = {}  # the windows of tracks in work
         self.num_failed_in_row = 0
         self.dropped: Counter[str] | None = Counter()  # of the windows that were asked; None once one was accepted
@@ -86,6 +87,7 @@ class Asking:
         try:
             with AnswerBook(path / ANSWERS) as answers, AnswerBook(path / JUDGEMENTS) as judgements:
                 self.books = (answers, judgements)
+                # Requests of both may be in flight when a limit of the budget is reached.
                 num_judging = self.cfg.judge.concurrency if self.cfg.judge.url else 0
                 most_in_flight = self.cfg.most_in_flight + num_judging
                 budget = Budget(self.cfg.budget, most_in_flight, answers.totals, judgements.totals)

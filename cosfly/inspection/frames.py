@@ -206,12 +206,12 @@ MASK_MIN_BOX_PX2 = 24.0  # a smaller box may contain no pixel centre of the targ
 
 @dataclass
 class FrameNumbers:
-    """Figures of the pixels of one track; lists are over the checked frames that show the target."""
+    """Figures of the pixels of one track."""
 
     num_checked: int = 0
     num_compared: int = 0  # with the previous frame
-    track_ious: list[float] = field(default_factory=list)
-    invalid_depth_shares: list[float] = field(default_factory=list)
+    track_ious: list[float] = field(default_factory=list)  # of the frames that show the target
+    invalid_depth_shares: list[float] = field(default_factory=list)  # of the frames with a depth image
 
 
 def check_frames(

@@ -103,10 +103,10 @@ class SampleOutcome:
 def make_prediction(
     sample: Sample, split: Split, text: str = "", num_tokens: int = 0, is_finished: bool = False, *, failure: str = ""
 ) -> Prediction:
-    """Parse an answer and return its record; without an answer, its reason counts as no wrong answer.
+    """Parse an answer and return its record.
 
     Args:
-        failure: code of the reason why there is no answer.
+        failure: Code of the reason why there is no answer; such a sample does not count as answered wrongly.
     """
     parsed = parse_answer(text, sample.language, finish_reason=None if is_finished else "length")
     own = sample.model_dump(include={"sample_id", "language", "run", "window_id"})
