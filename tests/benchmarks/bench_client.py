@@ -70,7 +70,7 @@ def _client(cfg: CaptionConfig, tree: Path, out: Path, encoded: dict[tuple, list
 
     The product is not merged: only asking counts.
     """
-    stage = open_stage(cfg, tree, out, 0, "never")
+    stage = open_stage(cfg, tree, out, 0)
     tracks, _ = find_inputs(cfg, tree)
     plain_encode = teacher.encode_frame
 

@@ -36,7 +36,7 @@ def simplification(maps: dict[str, BoxMap]) -> None:
     rows = []
     for name, raw in maps.items():
         times = [scenes.cpu_ms(lambda raw=raw: simplify(raw, SimplifyConfig())) for _ in range(3)]
-        rows.append([name, len(raw), len(times[-1][1].box_map), min(ms for ms, _ in times) / 1e3])
+        rows.append([name, len(raw), len(times[-1][1]), min(ms for ms, _ in times) / 1e3])
     scenes.print_table("simplify", ["map", "boxes", "left", "s"], rows)
 
 
