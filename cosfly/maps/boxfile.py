@@ -42,7 +42,7 @@ from cosfly.maps.footprints import (
 )
 from cosfly.maps.units import METRES, Units, declared_units, length_m, seen_units, to_metres
 from cosfly.runtime.config import Config, read_yaml
-from cosfly.runtime.errors import ConfigError, InputError, counts_text, nearest
+from cosfly.runtime.errors import ConfigError, InputError, nearest
 from cosfly.runtime.io import read_text
 from cosfly.runtime.json_io import read_json
 
@@ -217,9 +217,8 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
     for note, places in notes.items():
         log.warning("%s: %s", path.name, listed(places, note))
     if sources["levels"] or sources["default"]:
-        given = {name: count for name, count in sources.items() if name != "file"}
-        words = "%s: the file gives no size of %d of %d boxes: %s"
-        log.warning(words, path.name, sum(given.values()), sources.total(), counts_text(given))
+        words = "%s: %d boxes have their size from the file, %d a height from their storeys, %d a default size"
+        log.warning(words, path.name, *(sources[name] for name in ("file", "levels", "default")))
     header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows))
     update: dict[str, Any] = {"dropped_objects": dict(dropped.counts)} if dropped.counts else {}
     if set(sources) != {"file"}:
