@@ -219,7 +219,7 @@ def test_openstreetmap_and_overture_need_the_name_of_the_type_column(tmp_path, c
     assert_allclose(np.unique(2 * osm.half_extents[osm.kinds == 1][:, 1]), 7.0)
     assert (osm.header.num_objects, osm.header.dropped_objects) == (14, {"unmapped_type": 1})
     assert osm.header.extent_sources == {"file": 12, "default": 1, "levels": 1} | {"file": 13}
-    assert "default 1" in caplog.text
+    assert "1 a default size" in caplog.text
     of_ogr = [{**one, "properties": {"building": "yes", "other_tags": '"roof"=>"a \\"b\\"","height"=>"12 m"', "height": None}}
               for one in houses(*at, DEGREES)]  # fmt: skip
     box_map = loaded(tmp_path, collection(*of_ogr), ".geojson", type_column="building,highway,natural")

@@ -350,19 +350,25 @@ def print_table(
         head: Names of the columns, or none; `left` and the first column are left-aligned.
         is_answer: The table is the command's answer, on stdout; else it goes to stderr, as log lines do.
     """
+    from rich.measure import Measurement
     from rich.table import Table
 
     from cosfly.runtime.console import answer_console, console
 
     style = style if head else {"box": None}
     table = Table(title=title, title_justify="left", show_header=bool(head), **style)
+    rows = list(rows)
     for number, name in enumerate(head):
-        justify: Any = "right" if number and name not in left else "left"
-        longest = max(map(len, name.split()), default=0)  # a heading breaks at spaces alone
-        table.add_column(name, justify=justify, overflow="fold", min_width=longest)
+        is_left = number == 0 or name in left
+        # A heading breaks at spaces alone, and a number nowhere: a table may be wider than the terminal.
+        whole = [*name.split(), *(() if is_left else (str(row[number]) for row in rows))]
+        least = max(map(len, whole), default=0)
+        table.add_column(name, justify="left" if is_left else "right", overflow="fold", min_width=least)
     for row in rows:
         table.add_row(*row)
-    (answer_console if is_answer else console).print(table)
+    target = answer_console if is_answer else console
+    least = Measurement.get(target, target.options.update(max_width=1000), table).minimum
+    target.print(table, width=max(target.width, least), crop=False)
 
 
 def print_checks(checks: Iterable[Any], title: str | None = None, *, is_answer: bool = False) -> None:
