@@ -27,6 +27,8 @@ from cosfly.runtime.escaping import LONGEST_LOG, for_terminal
 
 log = logging.getLogger(__name__)
 
+MOST_LOGGED = 200  # characters of an answer that are logged when it arrives
+
 
 def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *, seed: int = 0) -> Iterator[str]:
     """Yield the lines that show a few windows: each question and answer, and what became of the window.
@@ -52,7 +54,7 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
 
     def record(sample_id: str, request: Request, reply: Reply) -> None:
         exchanges[sample_id].append((request, reply))
-        log.info("%s: answer %d", sample_id, len(exchanges[sample_id]))
+        log.info("%s: answer %d: %s", sample_id, len(exchanges[sample_id]), for_terminal(reply.text, MOST_LOGGED))
 
     async def ask() -> list[Caption | BaseException]:
         with AnswerBook(out / ANSWERS) as book:

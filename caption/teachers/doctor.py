@@ -8,6 +8,7 @@ import contextlib
 import math
 import time
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -106,12 +107,13 @@ class _Examination:
     def _add(self, name: str, state: State, detail: str) -> None:
         self.findings.append(Finding(name, state, detail))
 
-    async def _ask(self, messages: list[dict], max_tokens: int, schema: dict | None = None) -> Reply | str:
+    async def _ask(self, what: str, messages: list[dict], max_tokens: int, schema: dict | None = None) -> Reply | str:
         """Return the reply to one request, or why it failed."""
         endpoint = self.cfg.endpoint.model_copy(update={"max_tokens": max_tokens})
         start_s = time.monotonic()
         try:
-            reply = await self.client.ask(endpoint.request(messages, [], schema or {}, seed=0), self._count)
+            request = endpoint.request(messages, [], schema or {}, seed=0)
+            reply = await self.client.ask(request, partial(self._count, what))
         except (TimeoutError, httpx.RequestError) as error:
             return self.client.message_of(error)
         except Refusal as refusal:
@@ -124,14 +126,14 @@ class _Examination:
             self.tokens_per_s = reply.usage.completion_tokens / self.seconds
         return reply
 
-    def _count(self) -> None:
+    def _count(self, what: str) -> None:
         if self.num_requests == self.most_requests:
             raise _LimitReached
         self.num_requests += 1
-        self.advance(1, f"{self.num_requests} requests sent")
+        self.advance(1, f"{what}, limit {self.cfg.endpoint.timeout_s:g} s")
 
     async def _answers(self) -> bool:
-        reply = await self._ask([_user(READY)], self.cfg.endpoint.max_tokens)
+        reply = await self._ask("answers", [_user(READY)], self.cfg.endpoint.max_tokens)
         problem = reply if isinstance(reply, str) else _problem_of(reply)
         if isinstance(reply, str) or problem is not None:
             self._add("answers", "unusable", problem or "")
@@ -148,7 +150,7 @@ class _Examination:
         if not self.cfg.endpoint.json_schema:
             self._add("JSON schema", "ok", f"switched off (caption.endpoint.json_schema=false), {plain}")
             return
-        reply = await self._ask([_user("Hello! How are you today?")], 256, ODD_SCHEMA)
+        reply = await self._ask("JSON schema", [_user("Hello! How are you today?")], 256, ODD_SCHEMA)
         if refusal := self.client.left_out.get("schema"):
             self._add("JSON schema", "warning", f"refused, {plain}: {refusal}; {refusal.meaning.fix}")
             return
@@ -169,10 +171,10 @@ class _Examination:
         """Send as many pictures as a prompt of ours holds."""
         limit = self.cfg.endpoint.max_tokens
         pictures = [part for part in self.largest[1]["content"] if part["type"] == "image_url"]
-        reply, tokens = await self._ask([_user(READY, pictures)], limit), None
+        reply, tokens = await self._ask("pictures", [_user(READY, pictures)], limit), None
         count = f"{len(pictures)} pictures in a prompt"
         if (num_tokens := _prompt_tokens(reply)) is not None:
-            without = _prompt_tokens(await self._ask([_user(READY)], limit))
+            without = _prompt_tokens(await self._ask("no pictures", [_user(READY)], limit))
             tokens = None if without is None else num_tokens - without
         if isinstance(reply, str):
             self._add("image input", "unusable", f"a prompt with {len(pictures)} pictures gets no answer: {reply}")
@@ -189,7 +191,7 @@ class _Examination:
     async def _try_largest(self) -> None:
         """Send a prompt as long as ours get, with our answer limit and schema; report context and time."""
         limit, context = self.cfg.endpoint.max_tokens, self.client.context
-        reply = await self._ask(self.largest, limit, answer_schema(more=THEREFORE))
+        reply = await self._ask("the largest prompt", self.largest, limit, answer_schema(more=THEREFORE))
         if isinstance(reply, str):
             if self.seconds >= self.cfg.endpoint.timeout_s:
                 await self._report_too_slow()
@@ -212,7 +214,8 @@ class _Examination:
         """Report that the largest prompt gets no answer in time, and what helps."""
         endpoint = self.cfg.endpoint
         detail = f"the largest prompt gets no answer within {endpoint.timeout_s:g} s"
-        if endpoint.json_schema and not isinstance(await self._ask(self.largest, endpoint.max_tokens), str):
+        plain = "the largest prompt without a JSON schema"
+        if endpoint.json_schema and not isinstance(await self._ask(plain, self.largest, endpoint.max_tokens), str):
             found = f"but one within {self.seconds:.0f} s without a JSON schema"
             self._add("speed", "unusable", f"{detail}, {found}: set caption.endpoint.json_schema=false")
             return
@@ -245,7 +248,7 @@ class _Examination:
             return False
         system, question, *correction = self.largest
         padded = question | {"content": [*question["content"], {"type": "text", "text": PADDING}]}
-        num_tokens = _prompt_tokens(await self._ask([system, padded, *correction], MIN_TOKENS))
+        num_tokens = _prompt_tokens(await self._ask("a longer prompt", [system, padded, *correction], MIN_TOKENS))
         return num_tokens is not None and num_tokens <= used
 
 

@@ -12,7 +12,7 @@ const LABELS = {
     mask: "Compare mask", south: "first row is south", polygon: "polygon", holeOf: "hole", open_ring: "open", points: "points",
     keys: "Click: vertex. Drag: move. Double click on an edge: new vertex. Wheel: zoom; right drag: pan. Keys: arrows move the vertex by a cell (Shift: ten) or pan; N, B next and previous vertex; " +
       "Space: vertex at the cross; + - zoom; Esc: clear the selection.",
-    occupied: "occupied", margin: "safety margin", unused: "free, not used", free: "free", in_region: "in the region", walkable: "walkable", outside: "outside the map", cell: "cell",
+    occupied: "occupied", margin: "safety margin", unused: "free, other ground or too small", free: "free", in_region: "in the region", walkable: "walkable", outside: "outside the map", cell: "cell",
     region: "cells in the region", walkable_cells: "walkable cells", components: "components", large: "large enough", largest: "largest", used: "cells used",
     saved: "saved to", unsaved: "not saved", whole: "the whole map: no polygon is closed", few: "a polygon needs three vertices", nowhere: "a hole must begin inside a closed polygon",
     size: "the mask has a different size", expected: "expected", masked: "mask", same_region: "equal to the region", same_walkable: "equal to walkable cells", here: "only here", there: "only in the mask",

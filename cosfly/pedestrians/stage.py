@@ -208,7 +208,8 @@ def run(
             outputs.append(out / BYSTANDERS_FILE)
             summary["others"] = _write_bystanders(outputs[-1], [result.bystanders for result in results], header, cfg)
         write_json(out / "pedestrians_report.json", summary)
-        if share := summary["total"]["on_carriageway_share"]:
+        share = summary["total"]["on_carriageway_share"]
+        if share and cfg.road_cost == 1:
             words = "people are on carriageways, away from crossings, at %.1f %% of the points; "
             log.info(words + "pedestrians.road_cost=20 prefers pavements", 100 * share)
         write_bytes(out / "paths.png", draw_overview(ground, paths))
