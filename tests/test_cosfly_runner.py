@@ -249,14 +249,18 @@ CHILD = """
 import asyncio, sys, time
 from cosfly.llm.contract import run_until_interrupted
 
+def report_no_slow_steps():  # as development mode would on a busy machine
+    asyncio.get_running_loop().slow_callback_duration = 3600
+
 async def ask():
     await asyncio.sleep(3600)
 
 async def wait_in_a_thread():
+    report_no_slow_steps()
     asyncio.get_running_loop().run_in_executor(None, lambda: (print("asking", flush=True), time.sleep(2)))
 
 async def main():
-    asyncio.get_running_loop().slow_callback_duration = 3600  # on a busy machine, development mode would report steps
+    report_no_slow_steps()
     tasks = [asyncio.create_task(ask()) for _ in range(20)]
     print("asking", flush=True)
     try:
