@@ -109,13 +109,13 @@ def _stage(name: str, folder: Path) -> StageSummary:
 BASIS = "`cosfly run showcase` on a 2-core machine (docs/benchmarks.md)"
 RATES = {  # stage: unit, seconds per unit, MB per unit
     "maps": ("map", 0.2, 1.1),
-    "simplify": ("map", 5.6, 1.2),
+    "simplify": ("map", 1.4, 1.2),
     "pedestrians": ("pedestrians", 4.6 / 3, 0.3 / 3),
     "plan": ("pedestrians", 2.3 / 3, 0.4 / 3),
     "render": ("frames", 51.2 / 790.7, 1.95),
-    "inspect": ("frames", 8.3 / 790.7, 0.7 / 790.7),
+    "inspect": ("frames", 26.8 / 790.7, 0.7 / 790.7),
     "caption": ("windows", 4.0 / 804, 7.4 / 804),
-    "release": ("frames", 7.8 / 790.7, 1.95),
+    "release": ("frames", 25.4 / 790.7, 1.95),
 }
 START_S = 2.0  # of a stage and its workers, which `showcase` hides: inspect and release of `quickstart` take 2 to 4 s
 WALK_MPS = 1.0  # progress along the straight line from start to goal, with detours and stops
