@@ -94,12 +94,19 @@ def test_a_spent_budget_stops_the_run_and_a_larger_one_goes_on(tree, tmp_path, w
         with pytest.raises(TeacherError, match="captioning stopped"):  # the same budget is not spent twice
             run(settings(server.url, budget=budget, endpoint=few), tree, out)
         assert len(server.bodies) == answered
-        gaps = list((out / "parts").glob("*.gap"))
-        assert gaps
-        for gap in gaps if "max_cost" in budget else ():  # as a run that is killed before it writes the product again
-            gap.unlink()
         assert run(settings(server.url), tree, out).read_bytes() == whole
     assert len(server.bodies) == 44
+
+
+def test_a_share_of_a_flight_in_an_unfinished_product_is_not_taken_for_all_of_it(tree, tmp_path, whole):
+    out = tmp_path / "out"
+    with deciding() as server:
+        with pytest.raises(TeacherError):
+            run(settings(server.url, budget={"max_tokens": 35_000}, endpoint={"concurrency": 1}), tree, out)
+        assert len(list(read_captions(out / "captions.jsonl"))) > 0
+        for gap in (out / "parts").glob("*.gap"):  # as a run does that is killed before it writes the product again
+            gap.unlink()
+        assert run(settings(server.url), tree, out).read_bytes() == whole
 
 
 def test_the_quarantine_is_asked_about_again(tree, tmp_path, whole):
