@@ -22,6 +22,7 @@ from cosfly.geometry.axes import mask_box, wrap_deg
 from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.inspection import frames
 from cosfly.inspection.frames import check_bystanders
+from cosfly.inspection.pixels import NUM_IDS, Picture, measure_pixels
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
 from cosfly.inspection.track import check_plan
@@ -413,6 +414,15 @@ def test_a_planted_defect_is_found_in_that_flight_alone(specimen, tmp_path, subt
                 assert FRAME in issue.where or "points[3]" in issue.where or code in ("layout", "checksum", "illegible")
                 assert (broken.result, twin.result) == ("rejected", "accepted")
             assert code not in {issue.code for issue in twin.issues}
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (5, 1), (1, 5)])
+def test_a_picture_of_one_row_or_column_is_measured(shape):
+    kinds = np.full(shape, KINDS["Buildings"], np.uint8)
+    instance = np.dstack([kinds, np.ones_like(kinds), np.zeros_like(kinds)])
+    picture = Picture(np.full((*shape, 3), 90, np.uint8), np.ones(shape, np.float32), instance)
+    figures = measure_pixels(picture, np.zeros(NUM_IDS, bool), 0.9)
+    assert (figures.flat, figures.fighting, figures.magenta, figures.person_box) == (0.0, 0.0, 0.0, None)
 
 
 def test_every_check_has_a_planted_defect():

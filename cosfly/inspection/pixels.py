@@ -115,6 +115,8 @@ def _flat_surface(colours: np.ndarray, codes: np.ndarray, is_surface: np.ndarray
     red, green, blue = np.moveaxis(colours.astype(np.int32), 2, 0)
     shades = red | green << 8 | blue << 16
     is_pair = is_surface[:, :-1] & (codes[:, :-1] == codes[:, 1:])
+    if not is_pair.any():
+        return 0, 0
     is_equal = is_pair & (shades[:, :-1] == shades[:, 1:])
     # Sums over stretches of one id come first: they are few.
     ids = (codes[:, :-1] >> 8).ravel()
