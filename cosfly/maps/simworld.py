@@ -8,7 +8,7 @@ own surfaces, such as those of `cosfly world`, gets none added. `header.extent_s
 
 import logging
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 import shapely
@@ -63,8 +63,9 @@ class SimWorldConfig(Config):
     )
     licence: MapLicence = "apache-2.0"
     credits: str = Field("SimWorld, maitrix-org and contributors", description="attribution of the world's makers")
-    # largest share of objects whose assets have no kind or no size: they are dropped
-    most_skipped: ClassVar[float] = 0.2
+    most_skipped: float = Field(
+        0.0, ge=0, le=1, description="largest share of objects whose assets have no kind or size, which are dropped"
+    )
 
     @field_validator("sizes", mode="before")
     @classmethod
@@ -169,7 +170,10 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
         sources[_add_node(boxes, node, asset, size, stand_m, world)] += 1
     if has_surfaces and road_nodes:  # the world has its roads as surfaces
         dropped.counts["road_piece"] = len(road_nodes)
-    expected = "assets in a table of maps.simworld.sizes and in cosfly/simulators/assets.yaml, but for a fifth of them"
+    expected = (
+        f"at most {cfg.most_skipped:.0%} of the objects without a kind or size (maps.simworld.most_skipped); sizes are "
+        "in the tables of maps.simworld.sizes, kinds in cosfly/simulators/assets.yaml"
+    )
     dropped.check(world, len(nodes), cfg.most_skipped, expected)
     widths: dict[str, float] = {}
     num_asset_boxes = len(boxes)
