@@ -117,7 +117,9 @@ class _Examination:
         except (TimeoutError, httpx.RequestError) as error:
             return self.client.message_of(error)
         except Refusal as refusal:
-            return str(refusal) + ("" if refusal.meaning == MEANINGS["unknown"] else f"; {refusal.meaning.fix}")
+            return str(refusal) + (
+                "" if refusal.meaning == MEANINGS["unknown"] else f"; {self.client.fix_of(refusal.meaning)}"
+            )
         except BadReply as error:
             return str(error)
         finally:
@@ -182,7 +184,7 @@ class _Examination:
             detail = "but it is unknown whether the model sees them, because token usage is not reported"
             self._add("image input", "warning", f"{count} are accepted, {detail}")
         elif tokens < len(pictures):
-            ignored = f"{count} are accepted but ignored: they add {tokens} tokens; {MEANINGS['pictures'].fix}"
+            ignored = f"{count} are accepted but ignored: they add {tokens} tokens; {self.client.fix_of(MEANINGS['pictures'])}"
             self._add("image input", "unusable", ignored)
         else:
             self._add("image input", "ok", f"{count}, {tokens} tokens")

@@ -71,7 +71,8 @@ def doctor(
 ) -> None:
     """Test what a server can do: text, images, schema, thinking, context, time. Exit with 1 if it cannot caption."""
     _examine_endpoint(url, job.cfg.caption, limit)
-    typer.echo("Pass --no-check to cosfly caption with these settings: it would repeat the tests.")
+    if limit is None:
+        typer.echo("Pass --no-check to cosfly caption with these settings: it would repeat the tests.")
 
 
 def _examine_endpoint(url: str, cfg: CaptionConfig, limit: int | None = None) -> None:
