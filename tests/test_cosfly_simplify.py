@@ -16,6 +16,7 @@ from cosfly.simplify.stage import cross_validate, run
 from specimens import map_of
 
 VEGETATION, BUILDINGS, STATIC, ROADS = (KINDS[name] for name in ("Vegetation", "Buildings", "Static", "Roads"))
+PASSES = ["input", "merge", "crop_tree", "crop_below_ground", "prune_nested"]
 PAPER = {"min_fill": 0.0, "min_canopy_fill": 0.0, "trunk": "full"}
 
 
@@ -152,13 +153,7 @@ def test_the_simworld_variants_work_together():
         nested_tolerance_m=1e-6,
     )  # fmt: skip
     result = simplify(boxes, cfg)
-    assert [one.name for one in result.header.passes] == [
-        "input",
-        "merge",
-        "crop_tree",
-        "crop_below_ground",
-        "prune_nested",
-    ]
+    assert [one.name for one in result.header.passes] == PASSES
     solid = result.select(result.kinds != ROADS)
     assert solid.mins[:, 2].min() >= -1e-9
 
@@ -231,13 +226,7 @@ def test_the_whole_keeps_its_books(seed, paper):
     result = simplify(boxes, SimplifyConfig(**(PAPER if paper else {})))
     ids = result.ids.tolist()
     assert len(set(ids)) == len(ids)
-    assert [one.name for one in result.header.passes] == [
-        "input",
-        "merge",
-        "crop_tree",
-        "crop_below_ground",
-        "prune_nested",
-    ]
+    assert [one.name for one in result.header.passes] == PASSES
     assert result.header.passes[0].counts == boxes.counts()
     assert result.header.passes[-1].counts == result.counts()
     after_crop, after_ground = (sum(one.counts.values()) for one in result.header.passes[2:4])
