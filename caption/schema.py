@@ -34,28 +34,23 @@ TextState = Literal["relative", "paper"]
 
 @dataclass(frozen=True, eq=False)
 class ObservedFrame:
-    """The flight data of one frame, in plain numbers. Windows share it, so that its values are computed once.
-
-    position_m, target_m: (x, y, z), the target's NaN if unknown. rotation_deg: pitch, yaw, roll. target_uv: (u, v) px.
-    target_bbox: (left, top, right, bottom) px of the visible part of the target, or of its projected 3D box if the tree
-    has no masks; NaN if unknown. visibility: Score, NaN if unknown. legible: A visible target can be recognized.
-    others_in_view: Number of other people in view; other_distance_m: from the target to the nearest;
-    alike_differences: items in which the most alike of them looks different; NaN if unknown.
-    """
+    """The flight data of one frame, in plain numbers, NaN if unknown. Windows share it, so that values are computed
+    once."""
 
     time_s: float
-    position_m: Sequence[float]
-    rotation_deg: Sequence[float]
-    target_m: Sequence[float]
-    target_uv: Sequence[float]
+    position_m: Sequence[float]  # x, y, z of the drone
+    rotation_deg: Sequence[float]  # pitch, yaw, roll
+    target_m: Sequence[float]  # x, y, z
+    target_uv: Sequence[float]  # u, v, px
+    # Left, top, right, bottom, px: of the target's visible part, or of its projected 3D box in a tree without masks.
     target_bbox: Sequence[float]
     in_view: bool
     visible: bool
-    visibility: float
-    legible: bool = True
-    others_in_view: float = math.nan
-    other_distance_m: float = math.nan
-    alike_differences: float = math.nan
+    visibility: float  # rendered score
+    legible: bool = True  # a visible target can be recognized
+    others_in_view: float = math.nan  # number of other people in view
+    other_distance_m: float = math.nan  # from the target to the nearest of them
+    alike_differences: float = math.nan  # items in which the most similar of them looks different
 
 
 def observed_frames(*columns: np.ndarray) -> tuple[ObservedFrame, ...]:
@@ -65,45 +60,38 @@ def observed_frames(*columns: np.ndarray) -> tuple[ObservedFrame, ...]:
 
 @dataclass(frozen=True)
 class ObservedWindow:
-    """The observed frames t0..t(n-1) of one sample, oldest first; the last is the current one. Right-handed axes.
-
-    indices: Frame indices in the track. mission: Kind of the order that ends the pursuit (MISSION_KINDS) if it is known
-    at the current frame. goal: Description of the target by language, in tracks with other people.
-    frame_files: File names in each frame folder.
-    """
+    """The observed frames t0..t(n-1) of one sample, oldest first; the last is the current one. Right-handed axes."""
 
     sample_id: str
     town: str
     trajectory: str
     variant: str
-    indices: tuple[int, ...]
+    indices: tuple[int, ...]  # of the frames in the track
     width_px: int
     height_px: int
     frames: tuple[ObservedFrame, ...]
     frame_folders: tuple[Path, ...]
-    frame_files: tuple[frozenset[str], ...]
-    mission: str | None = None
-    goal: dict[Language, str] | None = None
+    frame_files: tuple[frozenset[str], ...]  # names of the files in each folder
+    mission: str | None = None  # the order that ends the pursuit (MISSION_KINDS), if it is known at the current frame
+    goal: dict[Language, str] | None = None  # description of the target, in tracks with other people
 
 
 @dataclass(frozen=True)
 class FutureMotion:
     """The motion after the current frame. Never shown to a teacher.
 
-    indices: (m,), of the future frames. time_s, yaw_deg, visible: (m + 1,), positions_m, targets_m: (m + 1, 3); the
-    first row is the current frame. speed_before_mps: Over the last observed step, the reference of a speed change.
-    order: The decision that the mission orders at the current frame.
+    Arrays have m + 1 rows: the current frame, then the m future ones.
     """
 
-    indices: tuple[int, ...]
-    time_s: np.ndarray
-    positions_m: np.ndarray
-    yaw_deg: np.ndarray
-    targets_m: np.ndarray
-    visible: np.ndarray
-    speed_before_mps: float
+    indices: tuple[int, ...]  # (m,), of the future frames
+    time_s: np.ndarray  # (m + 1,)
+    positions_m: np.ndarray  # (m + 1, 3), of the drone
+    yaw_deg: np.ndarray  # (m + 1,)
+    targets_m: np.ndarray  # (m + 1, 3)
+    visible: np.ndarray  # (m + 1,) bool
+    speed_before_mps: float  # over the last observed step, with which the future speed is compared
     label_from: LabelFrom = "flight"
-    order: str | None = None
+    order: str | None = None  # the decision that the mission orders at the current frame
 
 
 @dataclass(frozen=True)
@@ -280,5 +268,4 @@ class CaptionConfig(Config):
 
         The address of a teacher does not change its answers, and the digests of own files are recorded separately.
         """
-        own = "own" if self.prompts else None
-        return super().recorded() | {"teacher": self.teacher_kind, "prompts": own}
+        return super().recorded() | {"teacher": self.teacher_kind, "prompts": "own" if self.prompts else None}

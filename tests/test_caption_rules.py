@@ -97,5 +97,5 @@ def test_each_decision_has_a_family_and_each_family_sentences():
     assert len({english for english, _ in PAIRS}) >= 60
     for name, family in FAMILIES.items():
         assert sentences()["reasons"][name]
-        assert sentences()["consequences"][family.why]
+        assert sentences()["consequences"][family.consequences]
     assert {*TOPICS, *TOPICS_HIDDEN, *TOPICS_ORDERED, *STRIKING_TOPICS} == sentences()["facts"].keys()

@@ -27,19 +27,13 @@ THEREFORE = {"therefore": {"type": "string", "enum": list(TOKENS)}}
 
 @dataclass(frozen=True)
 class Draft:
-    """A caption in one language.
+    """A caption in one language."""
 
-    Args:
-        coc: its plain text. therefore: the decision to which the reasoning leads, of the English alone.
-        template: what the text was filled from. outside: the sentences without their slots.
-        num_filled: slots that were filled with a value.
-    """
-
-    coc: Coc
-    outside: tuple[str, ...]
-    template: Template | None = None
-    num_filled: int = 0
-    therefore: str | None = None
+    coc: Coc  # its plain text
+    outside: tuple[str, ...]  # the sentences without their slots
+    template: Template | None = None  # what the text was filled from
+    num_filled: int = 0  # slots that were filled with a value
+    therefore: str | None = None  # the decision to which the reasoning leads; only in English
 
     @property
     def written(self) -> dict[str, Any]:
@@ -49,16 +43,11 @@ class Draft:
 
 @dataclass(frozen=True)
 class Refused:
-    """An answer of the right structure that is not taken.
+    """An answer of the right structure that is not accepted."""
 
-    Args:
-        reason: a code that is counted. complaint: the fault and what is allowed, for the teacher. draft: what could be
-            read of the answer.
-    """
-
-    reason: str
-    complaint: str
-    draft: Draft | None = None
+    reason: str  # a code that is counted
+    complaint: str  # the fault and what is allowed, for the teacher
+    draft: Draft | None = None  # what could be read of the answer
 
 
 def fill_answer(written: Coc, facts: Facts, language: Language = "en") -> Draft | Refused:
@@ -66,17 +55,15 @@ def fill_answer(written: Coc, facts: Facts, language: Language = "en") -> Draft 
     filler = Filler(facts, written.flight_decision, language)
     problems: list[str] = []
     sentences: list[Sentence] = []
-    texts: dict[str, str] = {}
+    texts = dict.fromkeys(TEXTS, "")
     for name in TEXTS:
-        filled = ""
         for number, part in enumerate(cut_sentences(getattr(written, name)), 1):
             try:
                 sentence = read_sentence(part, language, len(facts))
-                filled += filler.fill(sentence)
+                texts[name] += filler.fill(sentence)
                 sentences.append(sentence)
             except InvalidSlot as error:
                 problems.append(f"{name}, sentence {number}: {error}.")
-        texts[name] = filled
     if problems:
         return Refused(INVALID_SLOT, " ".join(problems[:MAX_COMPLAINTS]))
     template = Template(critical_components=written.critical_components, reasoning_trace=written.reasoning_trace)
@@ -86,7 +73,7 @@ def fill_answer(written: Coc, facts: Facts, language: Language = "en") -> Draft 
 
 
 def fill_mirror(written: Coc, english: Draft, facts: Facts, is_translated: bool = True) -> Draft | Refused:
-    """Make the Chinese draft, and compare it with the English one, whose translation it always is."""
+    """Make the Chinese draft, and compare it with the English one; with slots it is always a translation of that."""
     assert english.template is not None
     if written.flight_decision != english.coc.flight_decision:
         return Refused("decision", f'"flight_decision" must stay {english.coc.flight_decision}.')
@@ -103,21 +90,23 @@ def fill_mirror(written: Coc, english: Draft, facts: Facts, is_translated: bool 
 def _compare(english: Template, chinese: Coc, facts: Facts) -> Refused | None:
     """Compare the Chinese template with the English one: the same slots in each sentence, each in its script."""
     for name in TEXTS:
-        parts_en, parts_zh = cut_sentences(getattr(english, name)), cut_sentences(getattr(chinese, name))
+        parts_en = cut_sentences(getattr(english, name))
+        parts_zh = cut_sentences(getattr(chinese, name))
         if len(parts_en) != len(parts_zh):
             counts = f"{len(parts_en)} sentences in English and {len(parts_zh)} in Chinese"
             return Refused("sentences", f"{name} has {counts}; write one for each.")
-        for number, (mine, other) in enumerate(zip(parts_en, parts_zh, strict=True), 1):
-            names = read_sentence(mine, "en", len(facts)).names
+        for number, (part_en, part_zh) in enumerate(zip(parts_en, parts_zh, strict=True), 1):
+            place = f"{name}, sentence {number}"
+            slots_en = read_sentence(part_en, "en", len(facts)).names
             try:
-                sentence = read_sentence(other, "zh", len(facts))
+                sentence = read_sentence(part_zh, "zh", len(facts))
             except InvalidSlot as error:
-                return Refused(INVALID_SLOT, f"{name}, sentence {number}: {error}.")
-            if names != sentence.names:
-                listed = "; ".join(f"{{{slot}}}" for slot in names) or "none"
-                return Refused("slots", f"{name}, sentence {number} must hold these slots and no other: {listed}.")
+                return Refused(INVALID_SLOT, f"{place}: {error}.")
+            if slots_en != sentence.names:
+                listed = "; ".join(f"{{{slot}}}" for slot in slots_en) or "none"
+                return Refused("slots", f"{place} must hold these slots and no other: {listed}.")
             if not sentence.is_in_script:
-                return Refused("script", f"{name}, sentence {number} is not written in Chinese.")
+                return Refused("script", f"{place} is not written in Chinese.")
     return None
 
 
@@ -142,10 +131,12 @@ _WORDS = (
 
 def fact_table(facts: Facts) -> str:
     """Return the facts of a window with the names of their slots, as they are filled in; unknown facts are omitted."""
-    filler, last = Filler(facts, "", "en"), len(facts) - 1
+    filler = Filler(facts, "", "en")
+    last = len(facts) - 1
 
     def listed(names: Iterable[str]) -> str:
-        return "; ".join(f"{{{name}}} {text}" for name in names if (text := filler.text_of(name)))
+        texts = {name: filler.text_of(name) for name in names}
+        return "; ".join(f"{{{name}}} {text}" for name, text in texts.items() if text)
 
     lines = []
     for name in _SERIES:
@@ -154,18 +145,20 @@ def fact_table(facts: Facts) -> str:
             continue
         unit = f" {written_unit(QUANTITIES[name].unit, 'en')}"
         series = ", ".join([(value or "-").removesuffix(unit) for value in values])
-        more = listed([f"change:{name}", f"trend:{name}"] if name in _SPANNED else [])
-        lines.append(f"{{{name}@t0}} to {{{name}@t{last}}}: {series}{unit}" + (f"; {more}" if more else ""))
-    seen = ", ".join([filler.text_of(f"visibility@t{i}") for i in range(last + 1)])
-    lines += [f"{{visibility@t0}} to {{visibility@t{last}}}: {seen}", listed(_NOW), listed(_WORDS)]
+        line = f"{{{name}@t0}} to {{{name}@t{last}}}: {series}{unit}"
+        if name in _SPANNED and (change := listed([f"change:{name}", f"trend:{name}"])):
+            line += f"; {change}"
+        lines.append(line)
+    words = ", ".join([filler.text_of(f"visibility@t{i}") for i in range(last + 1)])
+    lines += [f"{{visibility@t0}} to {{visibility@t{last}}}: {words}", listed(_NOW), listed(_WORDS)]
     return "Table of facts (- is not known; {decision} is a slot too):\n" + "\n".join(lines)
 
 
 # --- filling ----------------------------------------------------------------------------------------------------------
 
-_DIGITS = ("%.0f", "%.1f", "%.2f")
-_NEITHER = ("straight", "centred")
-_VOWEL = re.compile(r"[aeio]|8|1[18]\b")
+_DIGITS = ("%.0f", "%.1f", "%.2f")  # by the number of digits after the point
+_NEITHER = ("straight", "centred")  # words of a side that say neither side
+_VOWEL = re.compile(r"[aeio]|8|1[18]\b")  # what begins with a vowel when it is spoken: eight, eleven, eighteen
 
 
 class Filler:
@@ -187,6 +180,7 @@ class Filler:
             return ""
 
     def _write(self, slot: Slot) -> str:
+        """Return the text of a slot; InvalidSlot: its fact is not known or does not fit."""
         fact = self._decision(slot) if slot.reference is None else look_up(slot.reference, self.facts)
         if isinstance(fact, str):
             fault = "is not known in this window; leave it out"
@@ -200,30 +194,34 @@ class Filler:
             fix = f"it is {value} here, neither side: leave this slot out, or write `is {{{slot.name}}}`"
             raise InvalidSlot(f"{{{slot.name}}}: {fix}")
         if not isinstance(value, str):
-            word = _DIGITS[digits] % (abs(value) if slot.is_paired else value)
+            text = _DIGITS[digits] % (abs(value) if slot.is_paired else value)
         elif unit:  # a box
-            word = value if self.language == "en" else value.replace("x", "×")
+            text = value if self.language == "en" else value.replace("x", "×")
         else:
-            word = form_of(value, slot.form, self.language)
+            text = form_of(value, slot.form, self.language)
         if unit:
-            word += f"{'' if unit == 'percent' else ' '}{written_unit(unit, self.language)}"
-        return f"{slot.article}{'n' if _VOWEL.match(word) else ''} {word}" if slot.article else word
+            text += f"{'' if unit == 'percent' else ' '}{written_unit(unit, self.language)}"
+        if not slot.article:
+            return text
+        return f"{slot.article}{'n' if _VOWEL.match(text) else ''} {text}"
 
     def _decision(self, slot: Slot) -> Fact | Missing:
         if slot.name == "decision":
             action = ACTIONS[self.decision]
             return Fact(action.en if self.language == "en" else action.zh)
-        side = next((side for side in ("left", "right") if side in self.decision), None)
-        return "unknown_fact" if side is None else Fact(side)
+        for side in ("left", "right"):
+            if side in self.decision:
+                return Fact(side)
+        return "unknown_fact"
 
     def _side_of_number(self, slot: Slot) -> str | None:
-        """Return the side of the number next to a slot, where "straight" or "centred" says neither."""
+        """Return the side that the sign of the number next to a slot says, however small the number is; None for 0."""
         assert slot.reference is not None
         quantity = slot.reference.quantity
-        number = look_up(slot.reference._replace(aspect="change" if quantity in TURNS else ""), self.facts)
-        if not isinstance(number, Fact) or isinstance(number.value, str) or not number.value:
+        fact = look_up(slot.reference._replace(aspect="change" if quantity in TURNS else ""), self.facts)
+        if not isinstance(fact, Fact) or isinstance(fact.value, str) or not fact.value:
             return None
-        return QUANTITIES[quantity].side_of(number.value, 0.0)
+        return QUANTITIES[quantity].side_of(fact.value, 0.0)
 
 
 # --- the formats ------------------------------------------------------------------------------------------------------
@@ -231,19 +229,13 @@ class Filler:
 
 @dataclass(frozen=True)
 class AnswerFormat:
-    """One answer format.
+    """One answer format."""
 
-    Args:
-        system, mirror_system: names of the prompts that ask for it, in English.
-        table: what the question shows after the measured state; "" for nothing.
-        read: makes the English draft of an answer of the right structure.
-        read_mirror: makes the Chinese draft, and compares it with the English one, from which it is translated or not.
-    """
-
-    system: str
-    mirror_system: str
-    table: Callable[[Facts], str]
-    read: Callable[[Coc, Facts], Draft | Refused]
+    system: str  # name of the prompt that asks for an English answer
+    mirror_system: str  # name of the prompt that asks for the Chinese mirror
+    table: Callable[[Facts], str]  # returns what the question shows after the measured state; "" for nothing
+    read: Callable[[Coc, Facts], Draft | Refused]  # makes the English draft of an answer of the right structure
+    # Makes the Chinese draft and compares it with the English one; the flag says whether it is a translation of that.
     read_mirror: Callable[[Coc, Draft, Facts, bool], Draft | Refused]
 
 

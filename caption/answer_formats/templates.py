@@ -46,23 +46,16 @@ class InvalidSlot(ValueError):
 
 @dataclass(frozen=True)
 class Slot:
-    """One slot of a sentence.
+    """One slot of a sentence."""
 
-    Args:
-        name: what is looked up, the same for every form of a word. reference: None for the decision.
-        form: of the glossary's slot words: verb, after "is", after "has", after "to".
-        needs_side: "straight" or "centred" does not fit here.
-        is_paired: another slot of the sentence has the same direction: a number is written without its sign, and a side
-            is that of the number, however small.
-        article: "a" before the slot, which becomes "an" by the value; "" where none stands there.
-    """
-
-    name: str
-    reference: Reference | None
-    form: int = 0
-    needs_side: bool = False
+    name: str  # what is looked up, the same for every form of a word
+    reference: Reference | None  # None for the decision
+    form: int = 0  # of the glossary's slot words: 0 verb, 1 after "is", 2 after "has", 3 after "to"
+    needs_side: bool = False  # "straight" or "centred" does not fit here
+    # Another slot of the sentence has the same direction: a number is written without its sign, and a side is that of
+    # the number, however small.
     is_paired: bool = False
-    article: str = ""
+    article: str = ""  # "a" before the slot, which becomes "an" if the value needs it; "" if there is none
 
     @property
     def is_word(self) -> bool:
@@ -71,45 +64,40 @@ class Slot:
 
 @dataclass(frozen=True, slots=True)
 class Sentence:
-    """A sentence that may be filled.
+    """A sentence that may be filled."""
 
-    Args:
-        pattern: its text for `%`, with a place for each slot. outside: its text, with SLOT_MARK for each slot.
-        names: of the slots, sorted. num_values: slots that are filled with a value, the decision aside.
-    """
-
-    pattern: str
-    outside: str
+    pattern: str  # its text for the operator %, with %s for each slot
+    outside: str  # its text, with SLOT_MARK for each slot
     slots: tuple[Slot, ...]
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the slots, sorted
     is_in_script: bool
-    num_values: int
+    num_values: int  # slots that are filled with a value: all but those of the decision
 
 
 @lru_cache(maxsize=32768)  # neighbouring windows share most sentences
 def read_sentence(text: str, language: Language, num_frames: int) -> Sentence:
     """Read a sentence; InvalidSlot: it cannot be filled in any window of so many frames."""
     parts = _BRACES.split(text)
-    texts, names = parts[::2], parts[1::2]
+    texts, names = parts[::2], parts[1::2]  # slot i stands between texts i and i + 1
     if any("{" in part or "}" in part for part in texts):
         raise InvalidSlot("a brace is not closed or not opened")
     slots = list[Slot]()
-    for number, written in enumerate(names):
-        before, after = "".join(texts[: number + 1]), texts[number + 1]
+    for i, name in enumerate(names):
+        before, after = "".join(texts[: i + 1]), texts[i + 1]
         if is_negated(before.lower(), len(before), language):
-            raise InvalidSlot(f"{{{written}}}: a slot is a fact and always true: do not negate it")
-        slot = read_slot(written, texts[number], after, language)
-        texts[number + 1] = _without_repetition(slot, after, language)
+            raise InvalidSlot(f"{{{name}}}: a slot is a fact and always true: do not negate it")
+        slot = read_slot(name, texts[i], after, language)
+        texts[i + 1] = _without_repetition(slot, after, language)
         slots.append(slot)
     slots = _paired(slots, num_frames)
     outside = SLOT_MARK.join(texts)  # with the spaces and articles that the writer chose
     if language == "zh":  # a space before a number, none behind its unit
         texts[1:] = [re.sub(r"^ +(?=[\u4e00-\u9fff])", "", part) for part in texts[1:]]
     else:
-        for number, slot in enumerate(slots):
-            if match := _ARTICLE.search(texts[number]):
-                texts[number] = texts[number][: match.start()]
-                slots[number] = replace(slot, article=match[1])
+        for i, slot in enumerate(slots):
+            if match := _ARTICLE.search(texts[i]):
+                texts[i] = texts[i][: match.start()]
+                slots[i] = replace(slot, article=match[1])
     return Sentence(
         pattern="%s".join(part.replace("%", "%%") for part in texts),
         outside=outside,
@@ -131,7 +119,8 @@ def read_slot(written: str, before: str, after: str, language: Language) -> Slot
         bare = (written.partition(":")[2] or written).partition("@")[0].strip()
         near = nearest(bare, [*QUANTITIES, *WORDS, "decision", "comparison:speed"])
         raise InvalidSlot(f"there is no slot {{{written}}}{near}; use the names of the table of facts")
-    form, aspect = 0, reference.aspect
+    form = 0
+    aspect = reference.aspect
     if aspect in ("comparison", "compared"):
         form = 0 if _is_compared_with(after, language) else 1
     elif aspect == "trend" or reference.quantity in _VERBS:
@@ -145,7 +134,8 @@ def read_slot(written: str, before: str, after: str, language: Language) -> Slot
 
 
 class Direction(NamedTuple):
-    """What a word states or the sign of a number means, and the frames of which: `{yaw@t2}` is side:yaw of 0 to 2."""
+    """What a word states, or the sign of a number means, with the frames for which it does: `{yaw@t2}` has the
+    direction side:yaw of the frames 0 to 2."""
 
     name: str
     first: int
@@ -153,7 +143,7 @@ class Direction(NamedTuple):
 
 
 def _paired(slots: list[Slot], num_frames: int) -> list[Slot]:
-    """Mark numbers and words that state one direction, so that one says what the other leaves out.
+    """Return the slots, marked if a number and a word state the same direction: the word gives the sign.
 
     A number next to a direction of other frames is refused, since it could be the opposite one.
     """
@@ -162,13 +152,14 @@ def _paired(slots: list[Slot], num_frames: int) -> list[Slot]:
     of_words = {direction for slot, direction in pairs if direction and slot.is_word}
     of_numbers = {direction for slot, direction in pairs if direction and not slot.is_word}
     names_of_words = {direction.name for direction in of_words}
+    paired = []
     for slot, direction in pairs:
         if direction and not slot.is_word and direction.name in names_of_words and direction not in of_words:
             fix = "a side or a trend in its sentence is of other frames; name the same frames in both slots"
             raise InvalidSlot(f"{{{slot.name}}}: {fix}")
-    return [
-        replace(slot, is_paired=direction in (of_numbers if slot.is_word else of_words)) for slot, direction in pairs
-    ]
+        partners = of_numbers if slot.is_word else of_words
+        paired.append(replace(slot, is_paired=direction in partners))
+    return paired
 
 
 def _direction_of(slot: Slot, num_frames: int) -> Direction | None:
@@ -176,18 +167,18 @@ def _direction_of(slot: Slot, num_frames: int) -> Direction | None:
     if slot.reference is None or slot.reference.quantity in WORDS:
         return None
     name, aspect, first, last = slot.reference
-    last_frame = num_frames - 1
-    since = 0 if first is None else first
-    until = last_frame if last is None else last
-    frame = last_frame if first is None else first  # of a value at one frame
+    current = num_frames - 1
+    start = 0 if first is None else first  # of a span
+    end = current if last is None else last
+    frame = current if first is None else first  # of a value at one frame
     if aspect == "comparison":
-        return Direction("comparison", 0, last_frame)
+        return Direction("comparison", 0, current)
     if name == "yaw" and not aspect:  # a yaw is counted from t0
         return Direction("side:yaw", 0, frame)
     if name in TURNS and aspect in ("change", "rate", "growth", "side"):
-        return Direction(f"side:{name}", since, until)
+        return Direction(f"side:{name}", start, end)
     if not QUANTITIES[name].sides and aspect in ("change", "rate", "growth", "trend"):
-        return Direction(f"trend:{name}", since, until)
+        return Direction(f"trend:{name}", start, end)
     if aspect == "side" or (not aspect and has_sides(name)):
         return Direction(f"side:{name}", frame, frame)
     return None
@@ -215,7 +206,7 @@ def _is_compared_with(after: str, language: Language) -> bool:
 
 
 def _without_repetition(slot: Slot, after: str, language: Language) -> str:
-    """Remove what a slot brings itself: the unit of a number, the "than" of a comparison."""
+    """Return the text after a slot without what the slot itself brings: a number its unit, a comparison its "than"."""
     reference = slot.reference
     if reference is None or reference.aspect in ("side", "trend") or reference.quantity in WORDS:
         return after

@@ -16,7 +16,7 @@ from caption.schema import CaptionConfig, Window
 from caption.stage.ledger import explain_drops
 from caption.stage.tracks import TrackInput
 from caption.stage.window_loop import caption_window
-from caption.teachers.judge import open_judge
+from caption.teachers.judge import Judge, open_judge
 from caption.teachers.prompt_files import Vocabulary
 from caption.teachers.teacher import Teacher, open_teacher
 from cosfly.formats.captions import Caption, Usage, read_captions, write_captions
@@ -38,16 +38,12 @@ WAITING_WINDOWS = 16
 
 @dataclass
 class AskingOutcome:
-    """The outcome of a run.
-
-    unanswered: Windows without an answer. stopped: Why the run stopped before it asked about all of them.
-    judge_usage: Of all runs into the directory.
-    """
+    """The outcome of a run."""
 
     tracks: Tally = field(default_factory=Tally)
-    unanswered: list[Failed] = field(default_factory=list)
-    stopped: str | None = None
-    judge_usage: Usage | None = None
+    unanswered: list[Failed] = field(default_factory=list)  # windows
+    stopped: str | None = None  # why the run stopped before it asked about all windows
+    judge_usage: Usage | None = None  # of all runs into the directory
 
     @property
     def causes(self) -> str:
@@ -57,24 +53,35 @@ class AskingOutcome:
 
 
 class Asking:
-    """One run of a teacher over tracks."""
+    """One run of a teacher over tracks. The captions of a finished track are its part file, those of an unfinished one
+    its gap file (tracks.py)."""
+
+    # Opened by `run`.
+    teacher: Teacher
+    judge: Judge | None
+    books: tuple[AnswerBook, AnswerBook]  # journals of the teacher's answers and of the judgements
+    progress: "RunProgress"
 
     def __init__(
         self, stage: StageFolder, cfg: CaptionConfig, vocabulary: Vocabulary, seed: int, *, retry_failed: bool = False
     ) -> None:
-        self.stage, self.cfg, self.vocabulary, self.seed = stage, cfg, vocabulary, seed
+        self.stage = stage
+        self.cfg = cfg
+        self.vocabulary = vocabulary
+        self.seed = seed
         self.outcome = AskingOutcome()
         self.failures: list[Failed] = []  # tracks that cannot be read
         self.quarantine = read_quarantine(stage.path)
         # An answer that had filled the context, or in which the model declined, is asked for again.
         self.retried = frozenset(self.quarantine) if retry_failed else frozenset[str]()
         self.retried_tracks = {flight_of(sample_id) for sample_id in self.retried}
+        self.num_judging = cfg.judge.concurrency if cfg.judge.url else 0
         # One slot for each window in work. A window has one request in flight, to the teacher or to the judge.
-        num_asking = max(cfg.most_in_flight, cfg.judge.concurrency if cfg.judge.url else 0)
-        self.slots = asyncio.Semaphore(num_asking + WAITING_WINDOWS)
+        self.slots = asyncio.Semaphore(max(cfg.most_in_flight, self.num_judging) + WAITING_WINDOWS)
         self.begun: dict[TrackInput, list[asyncio.Task[Caption | None]]] = {}  # the windows of tracks in work
         self.num_failed_in_row = 0
-        self.dropped: Counter[str] | None = Counter()  # of the windows that were asked; None once one was accepted
+        self.has_accepted = False  # a caption, in this run or an earlier one
+        self.dropped = Counter[str]()  # captions of this run by reason, before the first accepted one
 
     async def run(self, tracks: list[TrackInput]) -> AskingOutcome:
         """Ask about every window that has no answer yet.
@@ -87,9 +94,8 @@ class Asking:
         try:
             with AnswerBook(path / ANSWERS) as answers, AnswerBook(path / JUDGEMENTS) as judgements:
                 self.books = (answers, judgements)
-                # Requests of both may be in flight when a limit of the budget is reached.
-                num_judging = self.cfg.judge.concurrency if self.cfg.judge.url else 0
-                most_in_flight = self.cfg.most_in_flight + num_judging
+                # Requests to both may be in flight when a limit of the budget is reached.
+                most_in_flight = self.cfg.most_in_flight + self.num_judging
                 budget = Budget(self.cfg.budget, most_in_flight, answers.totals, judgements.totals)
                 with progress_bar("caption", sum(guesses)) as advance:
                     self.progress = RunProgress(advance, sum(guesses), budget)
@@ -97,15 +103,15 @@ class Asking:
                         open_teacher(self.cfg, answers, self.seed, budget, self.retried) as teacher,
                         open_judge(self.cfg.judge, self.vocabulary, self.seed, judgements, budget) as judge,
                     ):
-                        self.judge = judge
-                        await self._ask_all(tracks, guesses, teacher)
+                        self.teacher, self.judge = teacher, judge
+                        await self._ask_all(tracks, guesses)
                 if self.progress.windows.input:
                     log.info("caption: %s", self.progress.figures())
                 if judgements.totals:
                     self.outcome.judge_usage = Usage(**{name: judgements.totals[name] for name in Usage.model_fields})
         finally:
-            windows = [failure for failure in self.outcome.unanswered if failure.code != NOT_ASKED]
-            write_failures(path / FAILURES, self.failures + windows)
+            failed_windows = [failure for failure in self.outcome.unanswered if failure.code != NOT_ASKED]
+            write_failures(path / FAILURES, self.failures + failed_windows)
             write_failures(path / QUARANTINE, self.quarantine.values())
         return self.outcome
 
@@ -115,8 +121,8 @@ class Asking:
             await asyncio.sleep(SECONDS_BETWEEN_LINES)
             self.progress.show()
 
-    async def _ask_all(self, tracks: list[TrackInput], guesses: list[int], teacher: Teacher) -> None:
-        """Keep `concurrency` requests in flight, whatever track they belong to."""
+    async def _ask_all(self, tracks: list[TrackInput], guesses: list[int]) -> None:
+        """Ask about the tracks that are not finished, in their order, as many windows at once as there are slots."""
         heartbeat = asyncio.create_task(self._show_progress())
         try:
             async with asyncio.TaskGroup() as tasks:  # an error in one task cancels the others
@@ -125,15 +131,11 @@ class Asking:
                     if part.exists() and track.name in self.retried_tracks:  # it is unfinished again
                         part.replace(track.gap(self.stage.path))
                     if part.exists():
-                        if self.dropped is not None and any(one.status == "accepted" for one in read_captions(part)):
-                            self.dropped = None
-                        self.outcome.tracks.input += 1
-                        self.outcome.tracks.kept += 1
-                        self.progress.skip(guess)
+                        self._skip_finished(part, guess)
                     elif not self.outcome.stopped:
-                        await self._ask_track(track, teacher, tasks)
+                        await self._ask_track(track, tasks)
         except BaseExceptionGroup as errors:
-            raise errors.exceptions[0] from None
+            raise errors.exceptions[0] from None  # the first one caused the others
         finally:
             heartbeat.cancel()
             for track in self.begun:
@@ -142,11 +144,19 @@ class Asking:
                 except (CosflyError, OSError) as error:  # the run already ends with another error
                     log.error("caption: %s: %s", track.name, error)
 
-    async def _ask_track(self, track: TrackInput, teacher: Teacher, tasks: asyncio.TaskGroup) -> None:
+    def _skip_finished(self, part: Path, num_windows: int) -> None:
+        """Count a track that an earlier run finished."""
+        if not self.has_accepted:
+            self.has_accepted = any(caption.status == "accepted" for caption in read_captions(part))
+        self.outcome.tracks.input += 1
+        self.outcome.tracks.kept += 1
+        self.progress.skip(num_windows)
+
+    async def _ask_track(self, track: TrackInput, tasks: asyncio.TaskGroup) -> None:
         """Begin the windows of a track; another task writes it after the last of them."""
         tally = self.outcome.tracks
         tally.input += 1
-        tally.kept += 1  # also if the run is interrupted here
+        tally.kept += 1  # until it fails or is too short, so that the counts add up if the run is interrupted
         windows = self.begun[track] = []
         is_cut = False
         try:
@@ -156,7 +166,7 @@ class Asking:
                     self.slots.release()
                     is_cut = True
                     break
-                windows.append(tasks.create_task(self._ask_window(window, teacher)))
+                windows.append(tasks.create_task(self._ask_window(window)))
         except InputError as error:
             del self.begun[track]
             self.failures.append(Failed(id=track.name, code=error.code, message=str(error)))
@@ -170,7 +180,7 @@ class Asking:
         tasks.create_task(self._write_track(track, is_cut))
 
     async def _write_track(self, track: TrackInput, is_cut: bool) -> None:
-        """Write the part of a track after its last window. One with a gap stays unfinished, for the next run."""
+        """Write the part of a track after its last window, or its gap if a window has no answer."""
         answers = await asyncio.gather(*self.begun[track])
         captions = [caption for caption in answers if caption is not None]
         if is_cut or len(captions) < len(answers):
@@ -193,11 +203,11 @@ class Asking:
         elif done:  # a window without an answer may have a caption of an earlier run there
             gap.unlink(missing_ok=True)
 
-    async def _ask_window(self, window: Window, teacher: Teacher) -> Caption | None:
+    async def _ask_window(self, window: Window) -> Caption | None:
         """Return the caption of a window; None without an answer."""
         sample_id = window.observed.sample_id
         try:
-            caption = await caption_window(window, teacher, self.cfg, self.vocabulary, self.judge)
+            caption = await caption_window(window, self.teacher, self.cfg, self.vocabulary, self.judge)
         except BudgetSpent as error:
             self.outcome.stopped = self.outcome.stopped or error.what
             self.outcome.unanswered.append(Failed(id=sample_id, code=NOT_ASKED, message=error.what))
@@ -205,7 +215,7 @@ class Asking:
             if isinstance(error, CosflyError) and error.fatal:
                 raise
             code = error.cause if isinstance(error, NoAnswer) else error.code
-            self._record_gap(Failed(id=sample_id, code=code, message=str(error)))
+            self._record_unanswered(Failed(id=sample_id, code=code, message=str(error)))
         else:
             self._record_refusal(caption)
             self._stop_if_hopeless(caption)
@@ -215,7 +225,7 @@ class Asking:
             self.slots.release()
         return None
 
-    def _record_gap(self, failure: Failed) -> None:
+    def _record_unanswered(self, failure: Failed) -> None:
         """Record a window without an answer."""
         self.outcome.unanswered.append(failure)
         self.quarantine[failure.id] = failure
@@ -247,9 +257,9 @@ class Asking:
     def _stop_if_hopeless(self, caption: Caption) -> None:
         """End the run if none of the first answers is accepted: the rest would be no better."""
         if caption.status == "accepted":
-            self.dropped = None
+            self.has_accepted = True
         limit = self.cfg.stop_after_dropped if self.cfg.teacher_kind in ("endpoint", "vllm") else 0
-        if self.dropped is None or not limit or not caption.attempts:
+        if self.has_accepted or not limit or not caption.attempts:
             return
         self.dropped[str(caption.drop_reason)] += 1
         if self.dropped.total() == limit:
@@ -275,7 +285,9 @@ class RunProgress:
     """Counts the outcomes of windows and moves the progress bar."""
 
     def __init__(self, advance: Advance, total: int, budget: Budget) -> None:
-        self._advance, self.num_left, self.budget = advance, total, budget
+        self._advance = advance
+        self.num_left = total
+        self.budget = budget
         self.windows = Tally()  # of this run
         self.num_repaired = 0
         self._start_s = time.monotonic()

@@ -58,35 +58,30 @@ async def caption_window(
 
 
 class WindowLoop:
-    """The asks of one window and their results.
-
-    caption: Its record so far. drafts: The answers that were accepted; a Chinese one may have been refused.
-    answered: The question that the English one answers; at first the free one.
-    """
+    """The asks of one window and their results."""
 
     def __init__(
-        self,
-        window: Window,
-        teacher: Teacher,
-        cfg: CaptionConfig,
-        vocabulary: Vocabulary,
-        judge: Judge | None = None,
+        self, window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary, judge: Judge | None = None
     ) -> None:
-        self.teacher, self.cfg, self.judge = teacher, cfg, judge
+        self.teacher = teacher
+        self.cfg = cfg
+        self.judge = judge
         self.terms = teacher.terms(window.observed.sample_id)
+        # The question that the accepted English answer answers; at first the free one.
         self.answered = make_question(window.observed, cfg.image, self.terms.writing, vocabulary)
+        self.format = self.answered.format
         motion = measure(window.future)
         self.label = TABLE.label_of(motion)
         self.contradicted = TABLE.contradicted_by(motion, self.label)
         is_fixed = self.terms.is_fixed
         self.fields = () if is_fixed else tuple(THEREFORE)  # of an English answer, beyond the paper's three
-        asks = (1, 0, 1) if is_fixed else (STRUCTURE_ASKS, CORRECTION_ASKS, MIRROR_ASKS)
-        self.structure_asks, self.correction_asks, self.mirror_asks = asks
-        self.format = self.answered.format
-        self.drafts: dict[Language, Draft] = {}
-        self._structured: str | None = None
-        self._recovered: set[str] = set()
-        self._refused: list[str] = []
+        self.structure_asks = 1 if is_fixed else STRUCTURE_ASKS
+        self.correction_asks = 0 if is_fixed else CORRECTION_ASKS
+        self.mirror_asks = 1 if is_fixed else MIRROR_ASKS
+        self.drafts: dict[Language, Draft] = {}  # the accepted answers; a Chinese one may have been refused
+        self._structured: str | None = None  # how the last answer got its structure
+        self._recovered: set[str] = set()  # corrections of the syntax of answers
+        self._refused: list[str] = []  # why answers of the right structure were refused
         self.checks = Checks(contradicted=self.contradicted)
         observed, pictures = window.observed, self.answered.pictures
         self.caption = Caption(
@@ -116,15 +111,18 @@ class WindowLoop:
         return self.drafts["en"]
 
     def finish(self, reason: str | None) -> Caption:
-        """Return the record of the window. reason: To drop it."""
-        caption, english, chinese = self.caption, self.drafts.get("en"), self.drafts.get("zh")
+        """Return the record of the window, which is dropped if there is a reason."""
+        caption = self.caption
         if caption.teacher.structured != self._structured:
             caption.teacher = caption.teacher.model_copy(update={"structured": self._structured})
-        if english is not None:
-            caption.en, caption.therefore = english.coc, english.therefore
-        caption.zh = chinese.coc if chinese else None
+        if english := self.drafts.get("en"):
+            caption.en = english.coc
+            caption.therefore = english.therefore
+        if chinese := self.drafts.get("zh"):
+            caption.zh = chinese.coc
         caption.slots = {language: draft.template for language, draft in self.drafts.items() if draft.template} or None
-        caption.status, caption.drop_reason = "accepted" if reason is None else "dropped", reason
+        caption.status = "accepted" if reason is None else "dropped"
+        caption.drop_reason = reason
         return caption
 
     async def run(self) -> str | None:
@@ -138,13 +136,19 @@ class WindowLoop:
             complaint = f"It contradicts the measured facts: {'; '.join(problems)}. Measured: {measured}."
             correction = Correction(dump_json(self.english.written), complaint, self.correction_asks + 1)
             self.drafts.clear()  # and what is recorded of the refused answer
-            self.caption.verdict = checks.values = checks.contradictions = None
+            self.caption.verdict = None
+            checks.values = None
+            checks.contradictions = None
             reason = await self._attempt(replace(self.answered, correction=correction))  # anchored, perhaps
-        checks.recovered, checks.refused = sorted(self._recovered) or None, self._refused or None
+        checks.recovered = sorted(self._recovered) or None
+        checks.refused = self._refused or None
         return reason
 
     async def _attempt(self, question: Question) -> str | None:
-        reason = await self.ask_freely(question) or await self._treat_verdict(question)
+        """Ask a question, treat the verdict on its answer, and ask for the mirror; return the reason to drop it."""
+        reason = await self.ask_freely(question)
+        if reason is None:
+            reason = await self._treat_verdict(question)
         if reason is None and self.terms.has_mirror:
             reason = await self._mirror()
         elif reason is None:
@@ -175,17 +179,18 @@ class WindowLoop:
 
     async def _answer(self, question: Question) -> Draft | Refused:
         """Ask, and ask for a correction while the content is refused. A wrong structure has no complaint."""
-        earlier = question.correction.number if question.correction else 0
-        for number in range(self.correction_asks + 1):
+        first = 1 + (question.correction.number if question.correction else 0)
+        for number in range(first, first + self.correction_asks + 1):
             reply = await self.teacher.ask(question)
             answer = self._draft(reply, question)
             if isinstance(answer, Draft) or not answer.complaint:
                 break
             self._refused.append(answer.reason)
-            question = replace(question, correction=Correction(reply.text, answer.complaint, earlier + number + 1))
+            question = replace(question, correction=Correction(reply.text, answer.complaint, number))
         return answer
 
     def _draft(self, reply: Reply, question: Question) -> Draft | Refused:
+        """Return the English draft of a reply, or why it is refused."""
         parsed = self._read(reply, "en")
         if parsed.coc is None:
             return Refused(parsed.reason or "", "")
@@ -200,6 +205,7 @@ class WindowLoop:
         return replace(draft, therefore=therefore) if isinstance(draft, Draft) else draft
 
     def _read(self, reply: Reply, language: Language) -> Parsed:
+        """Parse a reply, and record its use of tokens and why it is no answer."""
         usage = reply.usage or Usage()
         self.caption.attempts += 1
         self.caption.usage += usage
@@ -210,10 +216,8 @@ class WindowLoop:
         if parsed.reason == DECLINED:
             self.checks.refusal = f"{DECLINED}: {' '.join(reply.text.split())[:MOST_REFUSAL_TEXT]}"
         if parsed.reason == CONTEXT_FULL:
-            asked, answered = usage.prompt_tokens, usage.completion_tokens
-            self.checks.refusal = (
-                f"{CONTEXT_FULL}: a prompt of {asked} and an answer of {answered} tokens fill the context"
-            )
+            tokens = f"a prompt of {usage.prompt_tokens} and an answer of {usage.completion_tokens} tokens"
+            self.checks.refusal = f"{CONTEXT_FULL}: {tokens} fill the context"
         self._recovered.update(parsed.recovered)
         return parsed
 
@@ -247,16 +251,18 @@ class WindowLoop:
         )
         self.caption.judge = judgement = await judge.judge(conflict)
         if judgement.verdict == "ACCEPT_ALTERNATIVE":
-            if self.caption.verdict == "HARD_CONFLICT":
+            is_hard = self.caption.verdict == "HARD_CONFLICT"
+            if is_hard:
                 judgement.overruled_by = "geometry"
-            return self.caption.verdict == "HARD_CONFLICT"
+            return is_hard
         if judgement.verdict != "FIX_LABEL" or self.label is None:
             return True
         if ACTIONS[english.flight_decision].en in english.reasoning_trace.lower():
             judgement.overruled_by = "text"
             return True
         repair = self._begin_repair("fix_label")
-        repair.outcome, repair.rung = "repaired", "fix_label"
+        repair.outcome = "repaired"
+        repair.rung = "fix_label"
         fixed = english.model_copy(update={"flight_decision": self.label})
         self._accept(replace(self.english, coc=fixed), question)
         return False
@@ -285,22 +291,23 @@ class WindowLoop:
             else:
                 asked = replace(question, ask=self.structure_asks + ask)  # the same under another sampling seed
             answer = await self._answer(asked)
-            if isinstance(answer, Refused):
-                if answer.reason == CONTEXT_FULL:
-                    return CONTEXT_FULL  # not a failure of the teacher
-                continue
-            decision = answer.coc.flight_decision
-            verdict = verdict_on(decision, self.label, self.contradicted)
-            is_accepted = cfg.treatment_of(verdict) == "keep" and decision != rejected
-            if asked.decision is not None:
-                is_accepted = is_accepted and decision == asked.decision
-            if cfg.strategy == "cascade":  # surer rungs follow
-                is_accepted = is_accepted and verdict == "CONSISTENT"
-            if is_accepted:
+            if isinstance(answer, Draft) and self._is_repaired(answer.coc.flight_decision, rejected, asked.decision):
                 self._accept(answer, asked)
-                repair.outcome, repair.rung = "repaired", rung
+                repair.outcome = "repaired"
+                repair.rung = rung
                 return None
+            if isinstance(answer, Refused) and answer.reason == CONTEXT_FULL:
+                return CONTEXT_FULL  # not a failure of the teacher
         return "regeneration_failed"
+
+    def _is_repaired(self, decision: str, rejected: str, anchor: str | None) -> bool:
+        """Return whether a new decision replaces the rejected one. anchor: The decision that was asked for, if any."""
+        verdict = verdict_on(decision, self.label, self.contradicted)
+        if decision == rejected or self.cfg.repair.treatment_of(verdict) != "keep":
+            return False
+        if anchor is not None and decision != anchor:
+            return False
+        return self.cfg.repair.strategy != "cascade" or verdict == "CONSISTENT"  # else surer rungs follow
 
     # --- the Chinese mirror and the values ---
 

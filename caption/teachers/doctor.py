@@ -35,11 +35,11 @@ State = Literal["ok", "warning", "unusable"]
 MAX_COMPLAINT = 2000  # characters that a complaint hardly ever takes
 ODD_WORD = "zebra-41"  # what no model writes to a greeting unless it is made to
 ODD_SCHEMA = object_schema({"animal": {"type": "string", "enum": [ODD_WORD]}, "legs": {"type": "integer", "enum": [7]}})
-NUM_REQUESTS = 6  # of an examination without a failure: two of them are about pictures, one about the schema
 MAX_SHOWN = 200  # characters of an answer
 MIN_TOKENS = 64  # the smallest `max_tokens`
 BLOCK_PX = 8  # the JPEG of a random picture with such blocks takes 44 kB at 640 x 360 px, a rendered frame 49 to 57 kB
-PADDING = "Nothing has to change. " * 100  # makes a prompt longer by several hundred tokens
+SENTENCE = "Nothing has to change. "
+PADDING = SENTENCE * 100  # makes a prompt longer by several hundred tokens
 READY = "Reply with the one word: ready"
 NO_THINKING = "caption.endpoint.extra_body={chat_template_kwargs: {enable_thinking: false}}"
 
@@ -64,7 +64,9 @@ def examine_endpoint(
     Raises:
         TeacherError: The URL cannot be asked.
     """
-    with progress_bar("doctor", NUM_REQUESTS - 2 * (not cfg.num_images) - (not cfg.endpoint.json_schema)) as advance:
+    # A greeting, the schema, a prompt with pictures and one without, the largest prompt, a longer one.
+    num_requests = 1 + bool(cfg.endpoint.json_schema) + 2 * bool(cfg.num_images) + 2
+    with progress_bar("doctor", num_requests) as advance:
         largest = largest_messages(cfg, vocabulary)
         examination = _Examination(ChatClient(url, cfg.endpoint), cfg, largest, advance, most_requests)
         return run_until_interrupted(examination.run(), keeps_work=False)
@@ -74,15 +76,34 @@ class _LimitReached(Exception):
     """The examination has sent as many requests as it may."""
 
 
+@dataclass(frozen=True)
+class _Trial:
+    """The outcome of one request."""
+
+    reply: Reply | None  # None if the request failed
+    failure: str  # why it failed, "" if it did not
+    seconds: float
+
+    @property
+    def text(self) -> str:
+        return "" if self.reply is None else self.reply.text.strip()
+
+    @property
+    def prompt_tokens(self) -> int | None:
+        """Tokens of the prompt, None if the server does not report them."""
+        return None if self.reply is None or self.reply.usage is None else self.reply.usage.prompt_tokens
+
+
 @dataclass
 class _Examination:
+    """The checks of one endpoint, and their findings so far."""
+
     client: ChatClient
     cfg: CaptionConfig
     largest: list[dict]  # messages as long as ours get
     advance: Advance
     most_requests: int | None
     num_requests: int = 0
-    seconds: float = 0.0  # of the last request
     tokens_per_s: float | None = None  # of the last answer that reports its tokens
     findings: list[Finding] = field(default_factory=list)
 
@@ -90,10 +111,10 @@ class _Examination:
         try:
             await self.client.start()
             self._add("model", "ok", self.client.model)
-            if await self._answers():
-                await self._try_schema()
-                if not self.cfg.num_images or await self._takes_images():
-                    await self._try_largest()
+            if await self._check_answers():
+                await self._check_schema()
+                if not self.cfg.num_images or await self._check_images():
+                    await self._check_largest_prompt()
         except TeacherError as error:
             self._add("model", "unusable", str(error))
         except _LimitReached:
@@ -107,26 +128,26 @@ class _Examination:
     def _add(self, name: str, state: State, detail: str) -> None:
         self.findings.append(Finding(name, state, detail))
 
-    async def _ask(self, what: str, messages: list[dict], max_tokens: int, schema: dict | None = None) -> Reply | str:
-        """Return the reply to one request, or why it failed."""
+    async def _ask(self, what: str, messages: list[dict], max_tokens: int, schema: dict | None = None) -> _Trial:
+        """Send one request."""
         endpoint = self.cfg.endpoint.model_copy(update={"max_tokens": max_tokens})
+        request = endpoint.request(messages, [], schema or {}, seed=0)
+        reply, failure = None, ""
         start_s = time.monotonic()
         try:
-            request = endpoint.request(messages, [], schema or {}, seed=0)
             reply = await self.client.ask(request, partial(self._count, what))
         except (TimeoutError, httpx.RequestError) as error:
-            return self.client.message_of(error)
+            failure = self.client.message_of(error)
         except Refusal as refusal:
-            return str(refusal) + (
-                "" if refusal.meaning == MEANINGS["unknown"] else f"; {self.client.fix_of(refusal.meaning)}"
-            )
+            failure = str(refusal)
+            if refusal.meaning != MEANINGS["unknown"]:
+                failure += f"; {self.client.fix_of(refusal.meaning)}"
         except BadReply as error:
-            return str(error)
-        finally:
-            self.seconds = time.monotonic() - start_s
-        if reply.usage is not None and reply.usage.completion_tokens:
-            self.tokens_per_s = reply.usage.completion_tokens / self.seconds
-        return reply
+            failure = str(error)
+        seconds = time.monotonic() - start_s
+        if reply is not None and reply.usage is not None and reply.usage.completion_tokens:
+            self.tokens_per_s = reply.usage.completion_tokens / seconds
+        return _Trial(reply, failure, seconds)
 
     def _count(self, what: str) -> None:
         if self.num_requests == self.most_requests:
@@ -134,100 +155,108 @@ class _Examination:
         self.num_requests += 1
         self.advance(1, f"{what}, limit {self.cfg.endpoint.timeout_s:g} s")
 
-    async def _answers(self) -> bool:
-        reply = await self._ask("answers", [_user(READY)], self.cfg.endpoint.max_tokens)
-        problem = reply if isinstance(reply, str) else _problem_of(reply)
-        if isinstance(reply, str) or problem is not None:
-            self._add("answers", "unusable", problem or "")
+    async def _check_answers(self) -> bool:
+        """Send a greeting; return whether it is answered."""
+        trial = await self._ask("answers", [_user(READY)], self.cfg.endpoint.max_tokens)
+        if problem := _problem_of(trial):
+            self._add("answers", "unusable", problem)
             return False
-        text = reply.text.strip()
-        self._add("answers", "ok", f"{text[:40]!r} after {self.seconds:.1f} s (any text counts)")
-        is_off = not reply.num_thoughts and "<think" not in text
-        fix = f"the model thinks before it answers; switch thinking off with {NO_THINKING}"
-        self._add("thinking", "ok" if is_off else "warning", "off" if is_off else fix)
+        self._add("answers", "ok", f"{trial.text[:40]!r} after {trial.seconds:.1f} s (any text counts)")
+        if (trial.reply and trial.reply.num_thoughts) or "<think" in trial.text:
+            fix = f"switch thinking off with {NO_THINKING}"
+            self._add("thinking", "warning", f"the model thinks before it answers; {fix}")
+        else:
+            self._add("thinking", "ok", "off")
         return True
 
-    async def _try_schema(self) -> None:
+    async def _check_schema(self) -> None:
+        """Ask for an unusual answer by a schema, which shows whether the server applies it."""
         plain = "so answers are parsed from plain text"
         if not self.cfg.endpoint.json_schema:
             self._add("JSON schema", "ok", f"switched off (caption.endpoint.json_schema=false), {plain}")
             return
-        reply = await self._ask("JSON schema", [_user("Hello! How are you today?")], 256, ODD_SCHEMA)
+        trial = await self._ask("JSON schema", [_user("Hello! How are you today?")], 256, ODD_SCHEMA)
         if refusal := self.client.left_out.get("schema"):
             self._add("JSON schema", "warning", f"refused, {plain}: {refusal}; {refusal.meaning.fix}")
             return
-        if isinstance(reply, str):
-            self._add("JSON schema", "warning", f"not tested: {reply}")
+        if trial.reply is None:
+            self._add("JSON schema", "warning", f"not tested: {trial.failure}")
             return
         answer: object = None
         with contextlib.suppress(ValueError):
-            answer = parse_json(reply.text.strip())
+            answer = parse_json(trial.text)
         if answer == {"animal": ODD_WORD, "legs": 7}:
             self._add("JSON schema", "ok", "applied: the answer has the unusual shape of the schema")
         else:
-            got = f"accepted but ignored: asked for {{animal: {ODD_WORD}}}, got {reply.text.strip()[:40]!r}"
+            got = f"accepted but ignored: asked for {{animal: {ODD_WORD}}}, got {trial.text[:40]!r}"
             effect = f"{plain}, and an anchored decision is not enforced"
             self._add("JSON schema", "warning", f"{got}; {effect}")
 
-    async def _takes_images(self) -> bool:
-        """Send as many pictures as a prompt of ours holds."""
+    async def _check_images(self) -> bool:
+        """Send as many pictures as a prompt of ours holds; return whether the model may see them."""
         limit = self.cfg.endpoint.max_tokens
         pictures = [part for part in self.largest[1]["content"] if part["type"] == "image_url"]
-        reply, tokens = await self._ask("pictures", [_user(READY, pictures)], limit), None
+        trial = await self._ask("pictures", [_user(READY, pictures)], limit)
+        if trial.reply is None:
+            failure = f"a prompt with {len(pictures)} pictures gets no answer: {trial.failure}"
+            self._add("image input", "unusable", failure)
+            return False
         count = f"{len(pictures)} pictures in a prompt"
-        if (num_tokens := _prompt_tokens(reply)) is not None:
-            without = _prompt_tokens(await self._ask("no pictures", [_user(READY)], limit))
-            tokens = None if without is None else num_tokens - without
-        if isinstance(reply, str):
-            self._add("image input", "unusable", f"a prompt with {len(pictures)} pictures gets no answer: {reply}")
-        elif tokens is None:
+        without = None  # tokens of the prompt without pictures
+        if trial.prompt_tokens is not None:
+            without = (await self._ask("no pictures", [_user(READY)], limit)).prompt_tokens
+        if trial.prompt_tokens is None or without is None:
             detail = "but it is unknown whether the model sees them, because token usage is not reported"
             self._add("image input", "warning", f"{count} are accepted, {detail}")
-        elif tokens < len(pictures):
-            ignored = f"{count} are accepted but ignored: they add {tokens} tokens; {self.client.fix_of(MEANINGS['pictures'])}"
-            self._add("image input", "unusable", ignored)
-        else:
-            self._add("image input", "ok", f"{count}, {tokens} tokens")
-        return self.findings[-1].state != "unusable"
+            return True
+        tokens = trial.prompt_tokens - without
+        if tokens < len(pictures):
+            fix = self.client.fix_of(MEANINGS["pictures"])
+            self._add("image input", "unusable", f"{count} are accepted but ignored: they add {tokens} tokens; {fix}")
+            return False
+        self._add("image input", "ok", f"{count}, {tokens} tokens")
+        return True
 
-    async def _try_largest(self) -> None:
+    async def _check_largest_prompt(self) -> None:
         """Send a prompt as long as ours get, with our answer limit and schema; report context and time."""
+        endpoint = self.cfg.endpoint
+        schema = answer_schema(more=THEREFORE)
+        trial = await self._ask("the largest prompt", self.largest, endpoint.max_tokens, schema)
+        if trial.reply is not None:
+            await self._check_context(trial.prompt_tokens)
+            self._report_speed(trial.seconds)
+        elif trial.seconds >= endpoint.timeout_s:
+            await self._report_too_slow()
+        else:
+            self._add("context length", "unusable", f"the largest prompt gets no answer: {trial.failure}")
+
+    async def _check_context(self, used: int | None) -> None:
+        """Check that the largest prompt, of so many tokens if they are reported, and an answer fit the context."""
         limit, context = self.cfg.endpoint.max_tokens, self.client.context
-        reply = await self._ask("the largest prompt", self.largest, limit, answer_schema(more=THEREFORE))
-        if isinstance(reply, str):
-            if self.seconds >= self.cfg.endpoint.timeout_s:
-                await self._report_too_slow()
-            else:
-                self._add("context length", "unusable", f"the largest prompt gets no answer: {reply}")
-            return
-        seconds = self.seconds
-        used, known = _prompt_tokens(reply), f" of the context of {context}" if context else ""
         detail = f"{used or 'unknown'} tokens of the largest prompt and {limit} for the answer"
         if context and used is not None and used + limit > context:
             self._add("context length", "unusable", f"{detail}, more than {context}: {MEANINGS['too_long'].fix}")
-        elif await self._cuts_prompts(used):
+        elif used is not None and await self._cuts_prompts(used):
             cut = f"{used} tokens are counted for the largest prompt and for a longer one: the server drops the rest"
             self._add("context length", "unusable", f"{cut} without an error; {MEANINGS['too_long'].fix}")
         else:
-            self._add("context length", "ok", f"{detail}{known}")
-        self._report_speed(seconds)
+            self._add("context length", "ok", detail + (f" of the context of {context}" if context else ""))
 
     async def _report_too_slow(self) -> None:
         """Report that the largest prompt gets no answer in time, and what helps."""
         endpoint = self.cfg.endpoint
         detail = f"the largest prompt gets no answer within {endpoint.timeout_s:g} s"
-        plain = "the largest prompt without a JSON schema"
-        if endpoint.json_schema and not isinstance(await self._ask(plain, self.largest, endpoint.max_tokens), str):
-            found = f"but one within {self.seconds:.0f} s without a JSON schema"
-            self._add("speed", "unusable", f"{detail}, {found}: set caption.endpoint.json_schema=false")
-            return
+        if endpoint.json_schema:
+            plain = await self._ask("the largest prompt without a JSON schema", self.largest, endpoint.max_tokens)
+            if plain.reply is not None:
+                contrast = f"but one within {plain.seconds:.0f} s without a JSON schema"
+                self._add("speed", "unusable", f"{detail}, {contrast}: set caption.endpoint.json_schema=false")
+                return
         longer_s = 2 * endpoint.timeout_s
         if self.tokens_per_s:
             answer_s = endpoint.max_tokens / self.tokens_per_s
-            detail += (
-                f"; at {self.tokens_per_s:.1f} tokens/s, as in the answer before, {endpoint.max_tokens} tokens take"
-            )
-            detail += f" {answer_s:.0f} s"
+            speed = f"{self.tokens_per_s:.1f} tokens/s, as in the answer before"
+            detail += f"; at {speed}, {endpoint.max_tokens} tokens take {answer_s:.0f} s"
             longer_s = max(longer_s, 2 * answer_s)  # as much again for the prompt
         fix = f"set caption.endpoint.timeout_s={longer_s:.0f}, lower caption.endpoint.max_tokens"
         self._add("speed", "unusable", f"{detail}; {fix}, or use a faster server or a smaller model")
@@ -244,33 +273,28 @@ class _Examination:
             )
         self._add("speed", "ok", detail)
 
-    async def _cuts_prompts(self, used: int | None) -> bool:
-        """Return whether a longer prompt counts no more tokens than the largest one; False if they are not counted."""
-        if used is None:
-            return False
+    async def _cuts_prompts(self, used: int) -> bool:
+        """Send a longer prompt than the largest one; return whether it counts no more tokens."""
         system, question, *correction = self.largest
         padded = question | {"content": [*question["content"], {"type": "text", "text": PADDING}]}
-        num_tokens = _prompt_tokens(await self._ask("a longer prompt", [system, padded, *correction], MIN_TOKENS))
-        return num_tokens is not None and num_tokens <= used
+        longer = await self._ask("a longer prompt", [system, padded, *correction], MIN_TOKENS)
+        return longer.prompt_tokens is not None and longer.prompt_tokens <= used
 
 
-def _prompt_tokens(reply: Reply | str) -> int | None:
-    return None if isinstance(reply, str) or reply.usage is None else reply.usage.prompt_tokens
-
-
-def _problem_of(reply: Reply) -> str | None:
-    """Return why a reply to a simple question is not an answer; None if it is."""
-    text = reply.text.strip()
-    if reply.finish_reason == DECLINED:
-        return f"the model declines to answer: {text[:MAX_SHOWN]!r}"
-    if text:
-        return None
-    thoughts = "cut short at caption.endpoint.max_tokens before the text begins, probably by thinking"
-    if reply.num_thoughts:
-        thoughts = f"{reply.num_thoughts} characters of thinking and no answer"
-    elif reply.finish_reason != "length":
-        return "an empty answer"
-    return f"{thoughts}; switch thinking off with {NO_THINKING}, or raise caption.endpoint.max_tokens"
+def _problem_of(trial: _Trial) -> str:
+    """Return why a simple question has no answer; "" if it has one."""
+    if trial.reply is None:
+        return trial.failure
+    if trial.reply.finish_reason == DECLINED:
+        return f"the model declines to answer: {trial.text[:MAX_SHOWN]!r}"
+    if trial.text:
+        return ""
+    fix = f"switch thinking off with {NO_THINKING}, or raise caption.endpoint.max_tokens"
+    if trial.reply.num_thoughts:
+        return f"{trial.reply.num_thoughts} characters of thinking and no answer; {fix}"
+    if trial.reply.finish_reason == "length":
+        return f"cut short at caption.endpoint.max_tokens before the text begins, probably by thinking; {fix}"
+    return "an empty answer"
 
 
 def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary) -> list[dict]:
@@ -286,21 +310,22 @@ def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary) -> list[dict]:
         frame_folders=tuple(Path(str(i)) for i in range(count)),
         frame_files=(frozenset(VIEW_FILES.values()),) * count,
     )  # fmt: skip
-    refused = "Nothing has to change. " * (MAX_RETURNED_CHARACTERS // 23)
+    refused = SENTENCE * (MAX_RETURNED_CHARACTERS // len(SENTENCE))
     question = replace(
         make_question(window, cfg.image, cfg.writing, vocabulary),
         correction=Correction(refused, refused[:MAX_COMPLAINT], 1),
     )
 
-    def draw(number: int) -> list[EncodedImage]:
-        """Draw the pictures of a frame: random blocks, so that their files are as large as those of detailed frames."""
+    def make_pictures(frame_index: int) -> list[EncodedImage]:
+        """Make the pictures of a frame: random blocks, so that their files are as large as those of detailed frames."""
         width_px, height_px = question.pictures.size_px
         shape = (len(question.pictures.views), math.ceil(height_px / BLOCK_PX), math.ceil(width_px / BLOCK_PX), 3)
-        blocks = np.random.default_rng(number).integers(0, 256, shape, dtype=np.uint8)
+        blocks = np.random.default_rng(frame_index).integers(0, 256, shape, dtype=np.uint8)
         views = blocks.repeat(BLOCK_PX, axis=1).repeat(BLOCK_PX, axis=2)[:, :height_px, :width_px]
         return [encoded_image(picture) for picture in question.pictures.arranged(list(views))]
 
-    return question_messages(question, list(map(draw, range(count))))[0]
+    messages, _ = question_messages(question, [make_pictures(i) for i in range(count)])
+    return messages
 
 
 def _user(text: str, pictures: list[dict] | None = None) -> dict:

@@ -25,35 +25,27 @@ Frames = Sequence[Sequence[EncodedImage]]  # the pictures of each frame, oldest 
 
 @dataclass(frozen=True)
 class Correction:
-    """An answer that was refused, and why. number: of the ask that follows, from 1."""
+    """An answer that was refused, and why."""
 
     answer: str
     complaint: str
-    number: int
+    number: int  # of the ask that follows, from 1
 
 
 @dataclass(frozen=True)
 class Question:
-    """A question to a teacher about one window: facts for the rule teacher, prompts and pictures for a model.
-
-    Args:
-        prompts: with a mark in place of the sentence about the pictures; `asked` has the sentence.
-        decision: the decision that the answer must contain (anchored); None: the answer is free.
-        rejected: the decision of an earlier, rejected answer (hint).
-        ask: number of this ask among those of its kind, so that each has its own sampling seed and journal key.
-        correction: an answer to this question that was refused.
-    """
+    """A question to a teacher about one window: facts for the rule teacher, prompts and pictures for a model."""
 
     window: ObservedWindow
     facts: Facts
-    prompts: dict[Language, Prompt]
+    prompts: dict[Language, Prompt]  # with a mark in place of the sentence about the pictures, which `asked` has
     pictures: Pictures
     writing: Writing
     vocabulary: Vocabulary
-    decision: str | None = None
-    rejected: str | None = None
-    ask: int = 0
-    correction: Correction | None = None
+    decision: str | None = None  # that the answer must contain (anchored); None: the answer is free
+    rejected: str | None = None  # the decision of an earlier, rejected answer (hint)
+    ask: int = 0  # number among the asks of its kind, so that each has its own sampling seed and journal key
+    correction: Correction | None = None  # an answer to this question that was refused
 
     @property
     def purpose(self) -> str:
@@ -120,15 +112,15 @@ def _further_lines(window: ObservedWindow, facts: Facts, language: Language) -> 
     if window.goal:
         yield GOAL_WORDS[language] % window.goal[language]
     if None not in facts.others_in_view:
-        away = ["-" if one is None else f"{one:.1f}" for one in facts.other_distance_m]
-        alike = ["-" if one is None else str(one) for one in facts.alike_differences]
-        told = (map(str, facts.others_in_view), away, alike)
-        yield prompt_line("others", language) % tuple(", ".join(one) for one in told)
+        counts = ", ".join([str(count) for count in facts.others_in_view])
+        distances = ", ".join(["-" if away is None else f"{away:.1f}" for away in facts.other_distance_m])
+        differences = ", ".join(["-" if count is None else str(count) for count in facts.alike_differences])
+        yield prompt_line("others", language) % (counts, distances, differences)
     if window.mission is not None:
         yield prompt_line(window.mission, language)
 
 
-# What the relative state tells of the current frame, or of the whole window: quantity -> the words of its two directions.
+# Values of the current frame, or of the whole window, in the relative state: quantity -> the words of its two directions.
 _CURRENT = {
     "yaw_rate": "left_right", "yaw": "left_right", "forward_speed": "forward_backward",
     "sideways_speed": "left_right", "climb_speed": "up_down", "speed": None, "altitude": None,
@@ -136,7 +128,7 @@ _CURRENT = {
     "ahead": "forward_backward", "left": "left_right", "above": "up_down", "distance": None, "bearing": "left_right",
     "offset_x": "right_left", "offset_y": "down_up",
 }  # fmt: skip
-_FIRST = ("speed", "target_speed", "bearing")  # told of the first frame, too
+_FIRST = ("speed", "target_speed", "bearing")  # whose values at the first frame are in it, too
 # The size in pixels depends on the zoom, which differs between tracks and says nothing about the motion.
 _CHANGES = {
     Reference("altitude", "change"): "higher_lower",
@@ -146,35 +138,42 @@ _CHANGES = {
 
 
 def _relative_state(facts: Facts, language: Language) -> dict[str, str]:
-    """Return what holds now, some values of the first frame, and three changes, those of the slot `{change:...}`.
+    """Return values of the current frame, some of the first frame, and three changes, those of the slot `{change:...}`.
 
     A direction is a word, because a small student learns a sign badly. There is no value for each frame, because from
     the same windows it learns less the longer its prompts are.
     """
 
-    def told(value: float | None, digits: int, direction: str | None) -> str:
+    def written(value: float | None, digits: int, direction: str | None) -> str:
         if value is None:
             return prompt_line("unknown", language)
         text = f"{value:z.{digits}f}"
-        words = prompt_line(direction, language).split("/") if direction else None
-        return f"{words[text.startswith('-')]} {text.removeprefix('-')}" if words else text
+        if direction is None:
+            return text
+        positive, negative = prompt_line(direction, language).split("/")
+        return f"{negative if text.startswith('-') else positive} {text.removeprefix('-')}"
 
     _, left, above = facts.place_m[-1] or (None, None, None)
-    places = {"left": (left, 1), "above": (above, 1), "climb_speed": (facts.velocity_mps[2], 2)}
+    # Values that are no quantity of the slots, with their digits.
+    further = {"left": (left, 1), "above": (above, 1), "climb_speed": (facts.velocity_mps[2], 2)}
     state = {}
     for name, direction in _CURRENT.items():
-        now, digits = places.get(name) or (QUANTITIES[name].read(facts)[-1], QUANTITIES[name].digits)
-        state[name] = told(now, digits, direction)
+        if name in further:
+            state[name] = written(*further[name], direction)
+            continue
+        series, digits = QUANTITIES[name].read(facts), QUANTITIES[name].digits
+        state[name] = written(series[-1], digits, direction)
         if name in _FIRST:
-            state[f"first_{name}"] = told(QUANTITIES[name].read(facts)[0], digits, direction)
+            state[f"first_{name}"] = written(series[0], digits, direction)
     for change, direction in _CHANGES.items():
         fact = look_up(change, facts)
+        name = f"{change.quantity}_{change.aspect}"
         value, digits = (float(fact.value), fact.digits) if isinstance(fact, Fact) else (None, 0)
-        state[f"{change.quantity}_{change.aspect}"] = told(value, digits, direction)
+        state[name] = written(value, digits, direction)
     words = [form_of(word, 0, language) for word in facts.visibility]
-    state["visibility"] = (
-        prompt_line("in_all_frames", language) % words[0] if len(set(words)) == 1 else ", ".join(words)
-    )
+    state["visibility"] = ", ".join(words)
+    if len(set(words)) == 1:
+        state["visibility"] = prompt_line("in_all_frames", language) % words[0]
     return state
 
 
@@ -186,18 +185,16 @@ def _paper_state(window: ObservedWindow, facts: Facts, language: Language) -> di
         "(" + ", ".join([f"{axis_m:z.2f}" for axis_m in frame.target_m]) + ")" if place else unknown
         for frame, place in zip(window.frames, facts.place_m, strict=True)
     ]
-    poses = [(*frame.position_m, *frame.rotation_deg) for frame in window.frames]
+    poses = []
+    for frame in window.frames:
+        (x, y, z), (pitch, yaw, roll) = frame.position_m, frame.rotation_deg
+        poses.append(f"({x:z.2f}, {y:z.2f}, {z:z.2f}; {pitch:z.1f}, {yaw:z.1f}, {roll:z.1f})")
     return {
         # The oldest frame has no earlier one in the window: 0.0 by definition, as in the paper's sample.
         "speed": ", ".join(["0.0" if v is None else f"{v:.2f}" for v in facts.step_speeds_mps]),
         "altitude": ", ".join([f"{v:.1f}" for v in facts.altitude_m]),
         "yaw": ", ".join([f"{v:.1f}" for v in facts.yaw_deg]),
-        "pose": "; ".join(
-            [
-                f"({x:z.2f}, {y:z.2f}, {z:z.2f}; {pitch:z.1f}, {yaw:z.1f}, {roll:z.1f})"
-                for x, y, z, pitch, yaw, roll in poses
-            ]
-        ),
+        "pose": "; ".join(poses),
         "target_speed": f"{sum(speeds) / len(speeds):.2f} {written_unit('mps', language)}" if speeds else unknown,
         "target": "; ".join(positions),
         "visibility": ", ".join([form_of(word, 0, language) for word in facts.visibility]),
@@ -242,13 +239,14 @@ def mirror_messages(question: Question, english: Draft, complaint: str | None = 
 
 
 def pictures_of(window: ObservedWindow, cfg: ImageConfig) -> Pictures:
-    """Return which pictures of a window are sent: the wanted views that every observed frame has.
+    """Return which pictures of a window are sent: the views of the settings that every observed frame has.
 
-    Public trees can lack depth. Without any view, pixels are the camera's; if none is wanted, those of the settings.
+    Public trees can lack depth. If every view of the settings is missing, pixel values refer to the camera's picture.
     """
-    in_all = frozenset.intersection(*window.frame_files)
-    views = tuple([view for view in cfg.modalities if VIEW_FILES[view] in in_all])
-    size_px = scaled_size(window.width_px, window.height_px, cfg.max_side_px if views or not cfg.modalities else None)
+    in_all_frames = frozenset.intersection(*window.frame_files)
+    views = tuple([view for view in cfg.modalities if VIEW_FILES[view] in in_all_frames])
+    all_are_missing = bool(cfg.modalities) and not views
+    size_px = scaled_size(window.width_px, window.height_px, None if all_are_missing else cfg.max_side_px)
     return Pictures(views, size_px, cfg.layout, cfg.depth_range_m)
 
 

@@ -11,46 +11,39 @@ from dataclasses import dataclass
 from caption.verification.facts import Facts
 
 HORIZON_S = 2.5  # over which motion is extrapolated
-LEAST_TURN_DEG, LEAST_CLIMB_M, LEAST_ADVANCE_M = 3.0, 1.0, 1.0  # that call for a manoeuvre
+# Less expected motion than this calls for no manoeuvre.
+LEAST_TURN_DEG, LEAST_CLIMB_M, LEAST_ADVANCE_M = 3.0, 1.0, 1.0
 HINT = 0.5  # share of an expected manoeuvre that suggests it, where flying straight on is no answer
 ALMOST_STILL_MPS = 0.3  # a slower drone may hover
+MOST_SPEED_UP, LEAST_SPEED_MPS = 2.0, 0.05  # bounds of the present speed as a share of the window's mean speed
 SPEEDS = ("slow_down", "speed_up")  # which are not taken on a hint
 SHAKEN_M, SHAKEN_GAP_M = 0.4, 1.0  # a larger second difference of altitude, of distance: the track is perturbed
 
 
 @dataclass(frozen=True)
 class Gains:
-    """How much of the extrapolated motion is expected, fitted on training towns.
+    """How much of the extrapolated motion is expected, fitted on training towns."""
 
-    Attributes:
-        last_turn, turn, sight: of the turn of the nose in the last step and over its neighbours, and of the turn of the
-            line of sight to the target. bearing: of the target's bearing. climb: of the climb.
-        trend: steps over which the last change of the drone's speed goes on; 0: speeds are those of the whole window.
-        braking: of the last loss of speed, which calls for slowing down.
-        strafe_m, retreat_m, advance_m: extrapolated motion that calls for a strafe, a move backward, a move forward.
-        circle_m, circle_turn_deg, circle_walk: a circle is flown sideways so far and turned so much, round a target
-            that walks less than this share of it.
-        brisk_mps, lag_mps: a drone that flies so fast slows down; one that is so much slower than the target speeds up.
-        hover_mps, hover_walk_mps: the drone hovers where it and the target are slower.
-    """
-
-    last_turn: float
-    turn: float
-    sight: float
-    bearing: float
+    # Factors of what is extrapolated over HORIZON_S.
+    last_turn: float  # the turn of the nose in the last step
+    turn: float  # the turn of the nose, smoothed
+    sight: float  # the turn of the line of sight to the target
+    bearing: float  # the bearing of the target
     climb: float
-    trend: float
-    braking: float
+    trend: float  # steps over which the last change of the drone's speed goes on; 0: speeds are of the whole window
+    braking: float  # of the last loss of speed, which calls for slowing down
+    # Extrapolated motion that calls for a manoeuvre.
     strafe_m: float
     retreat_m: float
     advance_m: float
-    circle_m: float
-    circle_turn_deg: float
-    circle_walk: float
-    brisk_mps: float
-    lag_mps: float
-    hover_mps: float
-    hover_walk_mps: float
+    circle_m: float  # a circle is flown sideways so far,
+    circle_turn_deg: float  # with so large a turn,
+    circle_walk: float  # around a target that walks less than this share of it
+    # Speeds.
+    brisk_mps: float  # a faster drone slows down
+    lag_mps: float  # a drone that is so much slower than the target speeds up
+    hover_mps: float  # the drone hovers where it is slower
+    hover_walk_mps: float  # and the target is slower
 
 
 SMOOTH = Gains(
@@ -91,19 +84,21 @@ def decide(f: Facts) -> str:
 
 def ranked(f: Facts) -> list[str]:
     """Return the decisions that the observed frames lead to, that of `decide` first, then those that they suggest."""
-    first = decide(f)
+    strongest = decide(f)
     if f.mission is not None or not f.is_visible_now:
-        return [first]
+        return [strongest]
     sizes = expected_sizes(f)
-    others = sorted((token for token in sizes if sizes[token] >= 1.0), key=sizes.__getitem__, reverse=True)
-    is_hinted = not is_shaken(f)  # jitter is no hint
-    hinted = [token for token in sizes if is_hinted and HINT <= sizes[token] < 1.0 and token not in SPEEDS]
-    hinted.sort(key=sizes.__getitem__, reverse=True)
+    falling = sorted(sizes, key=sizes.__getitem__, reverse=True)
+    expected = [token for token in falling if sizes[token] >= 1.0]
     hovers = ["hover"] if f.mean_speed_mps < ALMOST_STILL_MPS else []
-    return list(dict.fromkeys([first, *others, "track_straight", *hovers, *hinted]))
+    hinted: list[str] = []
+    if not is_shaken(f):  # jitter is no hint
+        hinted = [token for token in falling if HINT <= sizes[token] < 1.0 and token not in SPEEDS]
+    return list(dict.fromkeys([strongest, *expected, "track_straight", *hovers, *hinted]))
 
 
 def _strongest(sizes: dict[str, float]) -> str:
+    """Return the decision with the largest size, if that is 1 or more; a hover and a circle go before their parts."""
     for tokens in (("hover",), ("circle_left", "circle_right"), tuple(sizes)):
         token = max(tokens, key=sizes.__getitem__)
         if sizes[token] >= 1.0:
@@ -119,12 +114,13 @@ def expected_sizes(f: Facts) -> dict[str, float]:
 
 
 def _expect(f: Facts, g: Gains) -> dict[str, float]:
-    speed_mps, walk_mps, gain_mps = f.speed_mps[-1] or 0.0, f.target_speed_mps or 0.0, 0.0
-    ahead_m, left_m, _ = [axis_mps * HORIZON_S for axis_mps in f.velocity_mps]
+    speed_mps, walk_mps = f.speed_mps[-1] or 0.0, f.target_speed_mps or 0.0
+    ahead_mps, left_mps, _ = f.velocity_mps
+    share, gain_mps = 1.0, 0.0  # of the window's velocity that lasts; the last change of speed
     if g.trend:
-        share = min(2.0, speed_mps / max(0.05, f.mean_speed_mps))
-        ahead_m, left_m = share * ahead_m, share * left_m
+        share = min(MOST_SPEED_UP, speed_mps / max(LEAST_SPEED_MPS, f.mean_speed_mps))
         gain_mps = (f.step_speeds_mps[-1] or 0.0) - (f.step_speeds_mps[-2] or 0.0)
+    ahead_m, left_m = share * (ahead_mps * HORIZON_S), share * (left_mps * HORIZON_S)
     turn_deg = _expected_turn_deg(f, g)
     climb_m = g.climb * (f.climb_mps[-1] or 0.0) * HORIZON_S
     is_sideways = abs(left_m) > abs(ahead_m)
@@ -142,11 +138,11 @@ def _expect(f: Facts, g: Gains) -> dict[str, float]:
     }
     for side, name in ((1, "left"), (-1, "right")):
         # A strafe keeps the nose still; a circle turns it back to a target that hardly walks.
-        is_held = is_sideways and side * turn_deg > -LEAST_TURN_DEG
-        is_round = is_sideways and walk_mps * HORIZON_S < g.circle_walk * abs(left_m)
-        is_round = is_round and -side * turn_deg > g.circle_turn_deg
-        sizes[f"strafe_{name}"] = side * left_m / g.strafe_m if is_held else 0.0
-        sizes[f"circle_{name}"] = side * left_m / g.circle_m if is_round else 0.0
+        keeps_nose = side * turn_deg > -LEAST_TURN_DEG
+        turns_back = -side * turn_deg > g.circle_turn_deg
+        hardly_walks = walk_mps * HORIZON_S < g.circle_walk * abs(left_m)
+        sizes[f"strafe_{name}"] = side * left_m / g.strafe_m if is_sideways and keeps_nose else 0.0
+        sizes[f"circle_{name}"] = side * left_m / g.circle_m if is_sideways and turns_back and hardly_walks else 0.0
     return sizes
 
 
@@ -166,14 +162,20 @@ def sight_rate_dps(f: Facts) -> float:
 def _slope(points: Sequence[tuple[float, float]]) -> float:
     """Return the slope of the straight line that fits points best."""
     middle = sum([x for x, _ in points]) / len(points)
-    return sum([(x - middle) * y for x, y in points]) / sum([(x - middle) ** 2 for x, _ in points])
+    norm = sum([(x - middle) ** 2 for x, _ in points])
+    return sum([(x - middle) * y for x, y in points]) / norm
 
 
 def _closing_m(f: Facts, ahead_m: float, left_m: float) -> float:
-    """Return how much nearer the drone comes to the target, as much as is its own doing; 0 where it is not known."""
-    place, walk = f.place_m[-1], f.target_velocity_mps
-    if place is None or walk is None:
+    """Return how much nearer the drone comes to the target, or would if that stood still, whichever is less.
+
+    0 if that is not known. ahead_m, left_m: the drone's expected displacement.
+    """
+    if f.place_m[-1] is None or f.target_velocity_mps is None:
         return 0.0
-    now_m, x, y = math.hypot(place[0], place[1]), place[0] - ahead_m, place[1] - left_m
-    then_m = math.hypot(x + walk[0] * HORIZON_S, y + walk[1] * HORIZON_S)
-    return min(now_m - math.hypot(x, y), now_m - then_m)
+    x, y, _ = f.place_m[-1]
+    walk_x, walk_y = [axis_mps * HORIZON_S for axis_mps in f.target_velocity_mps]
+    now_m = math.hypot(x, y)
+    if_standing_m = math.hypot(x - ahead_m, y - left_m)
+    then_m = math.hypot(x - ahead_m + walk_x, y - left_m + walk_y)
+    return min(now_m - if_standing_m, now_m - then_m)

@@ -37,9 +37,9 @@ class Facts:
     """Measured series, oldest frame first; None where a value cannot be measured.
 
     What is measured of the target is None at frames in which it is hidden or out of view. A velocity is the slope of
-    the straight line that fits positions best: of up to five neighbouring frames, or of the whole window where the
-    track jitters, so that a perturbation is not told as motion. Axes are those of the drone at the current frame:
-    forward along its heading, left, up. Angles in the horizontal plane are positive to the left.
+    the straight line that fits positions best: of up to five neighbouring frames, or of the whole window if the track
+    jitters, so that a perturbation is not reported as motion. Axes are those of the drone at the current frame: forward
+    along its heading, left, up. Angles in the horizontal plane are positive to the left.
     """
 
     # The drone.
@@ -86,6 +86,10 @@ class Facts:
     def __len__(self) -> int:
         return len(self.yaw_deg)
 
+    def place_axis_m(self, axis: int) -> Series:
+        """Return one axis of `place_m`: 0 forward, 1 left, 2 up."""
+        return [None if place is None else place[axis] for place in self.place_m]
+
     @property
     def is_visible_now(self) -> bool:
         """Return whether nothing hides the target. Labels depend on this."""
@@ -98,7 +102,7 @@ class Facts:
 
     @cached_property
     def found(self) -> dict[Any, Any]:
-        """What was computed from the facts, by key: several languages and checks need the same results."""
+        """Cache of what was computed from the facts, by key: several languages and checks need the same results."""
         return {}
 
 
@@ -143,14 +147,14 @@ def _measure_drone(frames: Sequence[ObservedFrame], step_s: float) -> dict[str, 
     yaw_deg = [0.0, *accumulate(turns_deg)]
     steps_m = [math.dist(before.position_m, after.position_m) for before, after in pairwise(frames)]
     is_known = (True,) * len(frames)
-    (v_x, v_y, v_z), local = _velocities(axes, is_known, step_s, SMOOTH_M)
+    (v_x, v_y, v_z), by_frame = _velocities(axes, is_known, step_s, SMOOTH_M)
     _, [yaw_rates_dps] = _velocities((yaw_deg,), is_known, step_s, SMOOTH_DEG)
     forward, left = _forward_left(v_x, v_y, frames[-1])
     return {
-        "speed_mps": _rounded([math.hypot(*velocity) for velocity in zip(*local, strict=True)], 2),
+        "speed_mps": _rounded([math.hypot(*velocity) for velocity in zip(*by_frame, strict=True)], 2),
         "velocity_mps": _rounded((forward, left, v_z), 2),
         "mean_speed_mps": _round(math.hypot(v_x, v_y, v_z), 2),
-        "climb_mps": _rounded(local[2], 2),
+        "climb_mps": _rounded(by_frame[2], 2),
         "yaw_deg": _rounded(yaw_deg, 1),
         "yaw_rate_dps": _rounded(yaw_rates_dps, 1),
         "travelled_m": (0.0, *_rounded(accumulate(steps_m), 1)),
@@ -167,27 +171,30 @@ def _measure_target(frames: Sequence[ObservedFrame], seen: tuple[bool, ...], ste
         places_m.append(_rounded((*_forward_left(away_x, away_y, frames[-1]), away_z), 1) if is_seen else None)
         positions.append(frame.target_m[:2] if is_seen else (math.nan, math.nan))
     first = positions[seen.index(True) if any(seen) else 0]
-    (v_x, v_y), local = (math.nan, math.nan), [[math.nan] * len(frames)] * 2
+    v_x, v_y = math.nan, math.nan
+    by_frame = [[math.nan] * len(frames)] * 2
     if sum(seen) >= LEAST_SEEN:
-        (v_x, v_y), local = _velocities(list(zip(*positions, strict=True)), seen, step_s, SMOOTH_M)
-    velocities = list(zip(*local, strict=True))
+        (v_x, v_y), by_frame = _velocities(list(zip(*positions, strict=True)), seen, step_s, SMOOTH_M)
+    velocities = list(zip(*by_frame, strict=True))
     speeds = [math.hypot(*velocity) for velocity in velocities]
     headings = [
-        math.degrees(math.atan2(y, x)) if speed > STANDING_MPS else math.nan  # NaN is not larger either
+        math.degrees(math.atan2(y, x)) if speed > STANDING_MPS else math.nan  # also if the speed is NaN
         for (x, y), speed in zip(velocities, speeds, strict=True)
     ]
-    known = [heading for heading in headings if not math.isnan(heading)]
-    speed = _round(math.hypot(v_x, v_y), 2)
+    known_headings = [heading for heading in headings if not math.isnan(heading)]
+    turn_deg = None  # the heading of someone who stands is noise
+    if known_headings and len(known_headings) == sum(seen):
+        turn_deg = _round(wrap_deg(known_headings[-1] - known_headings[0]), 1)
+    mean_speed = _round(math.hypot(v_x, v_y), 2)
     return {
         "place_m": tuple(places_m),
         "target_step_speeds_mps": (None, *_rounded([math.dist(a, b) / step_s for a, b in pairwise(positions)], 2)),
         "target_travelled_m": _rounded([math.dist(first, position) for position in positions], 1),
         "target_speeds_mps": _rounded(speeds, 2),
         "target_headings_deg": _rounded(headings, 1),
-        "target_velocity_mps": None if speed is None else _rounded(_forward_left(v_x, v_y, frames[-1]), 2),
-        "target_speed_mps": speed,
-        # The heading of someone who stands is noise.
-        "target_turn_deg": _round(wrap_deg(known[-1] - known[0]), 1) if known and len(known) == sum(seen) else None,
+        "target_velocity_mps": None if mean_speed is None else _rounded(_forward_left(v_x, v_y, frames[-1]), 2),
+        "target_speed_mps": mean_speed,
+        "target_turn_deg": turn_deg,
     }
 
 
@@ -204,13 +211,17 @@ class Fit(NamedTuple):
 
 @lru_cache(maxsize=256)
 def _fit_of(known: tuple[bool, ...]) -> Fit:
+    """Return the weights for a series that is known at some of its frames."""
+    count = len(known)
     frames = [i for i, is_known in enumerate(known) if is_known]
-    basis = np.vander(np.array(frames) - np.mean(frames), 3)
-    residuals = np.zeros((len(frames), len(known)))
-    residuals[:, frames] = np.eye(len(frames)) - basis @ np.linalg.pinv(basis)
-    neighbours = [[i for i in frames if abs(i - k) <= SMOOTHED_OVER] if known[k] else [] for k in range(len(known))]
-    lines = tuple(_line_weights(near, len(known)) for near in neighbours)
-    return Fit(_line_weights(frames, len(known)), lines, tuple(map(tuple, residuals.tolist())))
+    lines = []
+    for k, is_known in enumerate(known):
+        neighbours = [i for i in frames if abs(i - k) <= SMOOTHED_OVER] if is_known else []
+        lines.append(_line_weights(neighbours, count))
+    parabola = np.vander(np.array(frames) - np.mean(frames), 3)
+    residuals = np.zeros((len(frames), count))
+    residuals[:, frames] = np.eye(len(frames)) - parabola @ np.linalg.pinv(parabola)
+    return Fit(_line_weights(frames, count), tuple(lines), tuple(map(tuple, residuals.tolist())))
 
 
 def _line_weights(frames: Sequence[int], count: int) -> Weights:
@@ -229,11 +240,12 @@ def _weighted(weights: Weights, values: Sequence[float]) -> float:
 def _velocities(
     axes: Sequence[Sequence[float]], known: tuple[bool, ...], step_s: float, smooth: float
 ) -> tuple[list[float], list[list[float]]]:
-    """Return the slope of each axis over the whole window, and at each frame, NaN where the frame is not known.
+    """Return the slope of each axis over the whole window, and of each axis at each frame, NaN if that is not known.
 
     Args:
-        smooth: the largest root mean square deviation from a parabola, in units of the axes, at which neighbouring
-            frames tell the velocity; beyond it every frame has that of the whole window.
+        axes: for each axis its values at the frames; a velocity is their slope per second.
+        smooth: the largest root mean square deviation from a parabola, in units of the axes, of a track without jitter;
+            beyond it every frame has the velocity of the whole window, not that of its neighbours.
     """
     fit = _fit_of(known)
     if not all(known):  # a weight of 0 does not hide NaN
@@ -248,14 +260,15 @@ def _velocities(
 @lru_cache(maxsize=64)  # five windows of a track share a frame
 def _measure_frame(frame: ObservedFrame, camera_px: tuple[int, int], picture_px: tuple[int, int]) -> dict[str, Any]:
     """Measure one frame; return the facts BY_FRAME, without those of a target that is not seen."""
-    (x, y, z), (target_x, target_y, target_z) = frame.position_m, frame.target_m
+    x, y, z = frame.position_m
+    target_x, target_y, target_z = frame.target_m
     pitch, heading, _ = frame.rotation_deg
-    word = _word(frame)
+    visibility = _visibility_word(frame)
     facts: dict[str, Any] = {
         "altitude_m": _round(z, 1), "pitch_deg": _round(pitch, 1), "heading_deg": _round(wrap_deg(heading), 1),
-        "visibility": word,
+        "visibility": visibility,
     }  # fmt: skip
-    if math.isnan(target_x) or word in ("occluded", "out_of_view"):
+    if math.isnan(target_x) or visibility in ("occluded", "out_of_view"):
         return facts
     # + 0.0: no negative zero, which is equal to zero here and another direction to atan2
     away_x, away_y, away_z = target_x - x + 0.0, target_y - y + 0.0, target_z - z + 0.0
@@ -289,7 +302,7 @@ def _rounded(values: Iterable[float], digits: int | None) -> tuple[Any, ...]:
     return tuple([_round(value, digits) for value in values])
 
 
-def _word(frame: ObservedFrame) -> VisibilityWord:
+def _visibility_word(frame: ObservedFrame) -> VisibilityWord:
     if not (frame.in_view and frame.visible):
         return "occluded" if frame.in_view else "out_of_view"
     if not frame.legible:

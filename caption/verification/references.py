@@ -36,24 +36,21 @@ CLEAR_RATIO = 3.0  # a trend is larger than the deviation from its straight line
 
 @dataclass(frozen=True)
 class Quantity:
-    """A measured series.
-
-    Args:
-        unit: a key of the glossary's units. digits: after the point, as printed.
-        steady: the widest spread over a span that counts as no change; steady_share: or this share of the value.
-        sides: words for positive, negative and neither; () where the sign says nothing about a side.
-    """
+    """A measured series."""
 
     read: Callable[[Facts], Series]
-    unit: str
-    digits: int
-    steady: float
-    steady_share: float = 0.0
-    sides: tuple[str, str, str] | tuple[()] = ()
+    unit: str  # a key of the glossary's units
+    digits: int  # after the point, as printed
+    steady: float  # the widest spread over a span that counts as no change,
+    steady_share: float = 0.0  # or this share of the value, whichever is more
+    sides: tuple[str, str, str] | tuple[()] = ()  # words for positive, negative, neither; () if the sign is no side
 
     def side_of(self, value: float, dead_band: float) -> str:
-        positive, negative, between = self.sides or ("", "", "")
-        return between if abs(value) < dead_band else positive if value > 0 else negative
+        """Return the word for the side of a value; values nearer to 0 than the dead band are on neither."""
+        positive, negative, neither = self.sides or ("", "", "")
+        if abs(value) < dead_band:
+            return neither
+        return positive if value > 0 else negative
 
 
 LEFT_RIGHT = ("left", "right", "straight")
@@ -61,11 +58,11 @@ TURNS = ("yaw", "target_heading")  # whose side is that of a change
 
 
 def _now(read: Callable[[Facts], float | None]) -> Callable[[Facts], Series]:
-    """Return the series of what is known for the whole window: its value stands at the current frame."""
-    return lambda f: (*(None,) * (len(f) - 1), read(f))
+    """Return the series of a value of the whole window: None at all frames but the current one."""
+    return lambda f: (*[None] * (len(f) - 1), read(f))
 
 
-_UNKNOWN = (None, None)
+_UNKNOWN = (None, None)  # for the velocity of a target that is not seen often enough
 
 QUANTITIES: dict[str, Quantity] = {
     "speed": Quantity(attrgetter("speed_mps"), "mps", 2, 0.3),
@@ -73,13 +70,13 @@ QUANTITIES: dict[str, Quantity] = {
     "backward_speed": Quantity(_now(lambda f: 0.0 - f.velocity_mps[0]), "mps", 2, 0.3),
     "sideways_speed": Quantity(_now(lambda f: f.velocity_mps[1]), "mps", 2, 0.3, sides=LEFT_RIGHT),
     "climb_rate": Quantity(attrgetter("climb_mps"), "mps", 2, 0.3),
-    "sink_rate": Quantity(lambda f: [climb and -climb for climb in f.climb_mps], "mps", 2, 0.3),
+    "sink_rate": Quantity(lambda f: [None if v is None else 0.0 - v for v in f.climb_mps], "mps", 2, 0.3),
     "altitude": Quantity(attrgetter("altitude_m"), "m", 1, 0.5),
     "yaw": Quantity(attrgetter("yaw_deg"), "deg", 1, 1.0, sides=LEFT_RIGHT),
     "yaw_rate": Quantity(attrgetter("yaw_rate_dps"), "dps", 1, 2.0, sides=LEFT_RIGHT),
     "pitch": Quantity(attrgetter("pitch_deg"), "deg", 1, 1.0),
     "travelled": Quantity(attrgetter("travelled_m"), "m", 1, 0.5),
-    "ahead": Quantity(lambda f: [place and place[0] for place in f.place_m], "m", 1, 0.5),
+    "ahead": Quantity(lambda f: f.place_axis_m(0), "m", 1, 0.5),
     "distance": Quantity(attrgetter("distance_m"), "m", 1, 0.5),
     "height_over_target": Quantity(attrgetter("height_over_target_m"), "m", 1, 0.5),
     "target_speed": Quantity(attrgetter("target_speeds_mps"), "mps", 2, 0.3),
@@ -106,11 +103,11 @@ _REVERSED = {"increasing": "decreasing", "decreasing": "increasing"}
 
 
 class Reference(NamedTuple):
-    """An address. aspect: "" for the value at a frame. first, last: frames of the span, None for the default."""
+    """An address."""
 
     quantity: str
-    aspect: str = ""
-    first: int | None = None
+    aspect: str = ""  # one of ASPECTS, "comparison" or "compared"; "" for the value at a frame
+    first: int | None = None  # frame, or first frame of the span; None for the default
     last: int | None = None
 
     def __str__(self) -> str:
@@ -139,14 +136,19 @@ def parse_reference(text: str) -> Reference | None:
         return Reference(name, aspect) if name == "speed" else None  # of the whole window
     if last is not None and (not aspect or (first is not None and first > last)):
         return None
+    return Reference(name, aspect, first, last) if _has_aspect(name, aspect) else None
+
+
+def _has_aspect(name: str, aspect: str) -> bool:
+    """Return whether a quantity or word is known and has an aspect."""
     quantity = QUANTITIES.get(name)
     if quantity is None:
-        is_known = name in WORDS and not aspect
-    elif aspect in ("side", "rate"):
-        is_known = bool(quantity.sides) if aspect == "side" else quantity.unit in RATE_UNITS
-    else:
-        is_known = aspect in ("", *ASPECTS)
-    return Reference(name, aspect, first, last) if is_known else None
+        return name in WORDS and not aspect
+    if aspect == "side":
+        return bool(quantity.sides)
+    if aspect == "rate":
+        return quantity.unit in RATE_UNITS
+    return aspect in ("", *ASPECTS)
 
 
 # --- what is true -----------------------------------------------------------------------------------------------------
@@ -156,31 +158,33 @@ _NOW = -1  # the current frame; of a motion, the whole window
 
 def look_up(reference: Reference, facts: Facts) -> Fact | Missing:
     """Return the fact at an address, or why there is none."""
-    found: Fact | Missing | None = facts.found.get(reference)
-    if found is None:
-        found = facts.found[reference] = _find(reference, facts)
-    return found
+    fact: Fact | Missing | None = facts.found.get(reference)
+    if fact is None:
+        fact = facts.found[reference] = _measure(reference, facts)
+    return fact
 
 
-def _find(reference: Reference, facts: Facts) -> Fact | Missing:
+def _measure(reference: Reference, facts: Facts) -> Fact | Missing:
     name, aspect, first, last = reference
     if max(first or 0, last or 0) >= len(facts):
         return "unobserved_frame"
     at = _NOW if first is None else first
-    value: float | str | None
     if name in WORDS or aspect in RELATIONS:
-        value = _relation(reference, facts, at) if aspect else _word(name, facts, at)
-        return "unknown_fact" if value is None else Fact(value, "px" if name == "box" else "")
+        word = _relation(reference, facts, at) if aspect else _word(name, facts, at)
+        return "unknown_fact" if word is None else Fact(word, "px" if name == "box" else "")
     quantity = QUANTITIES[name]
     unit, digits = quantity.unit, quantity.digits
-    value = _over_span(reference, facts) if aspect else quantity.read(facts)[at]
+    if not aspect:
+        value = quantity.read(facts)[at]
+        return "unknown_fact" if value is None else Fact(value, unit, digits)
+    value = _over_span(reference, facts)
     if value is None:
         return "unknown_fact"
     if aspect == "rate":
         unit = RATE_UNITS[unit]
     elif aspect == "growth":
         unit, digits = "percent", 0
-    return Fact(round(value, digits) + 0.0 if aspect else value, unit, digits)
+    return Fact(round(value, digits) + 0.0, unit, digits)  # + 0.0: no negative zero
 
 
 def _word(name: str, f: Facts, at: int) -> str | None:
@@ -200,48 +204,60 @@ def _word(name: str, f: Facts, at: int) -> str | None:
             course, bearing = f.target_headings_deg[at], f.bearing_deg[at]
             if course is None or bearing is None:
                 return None
-            off_deg = abs(wrap_deg(course - f.heading_deg[at] - bearing))
-            return "away" if off_deg < ACROSS_DEG else "towards" if off_deg > 180.0 - ACROSS_DEG else "across"
+            from_sight_deg = abs(wrap_deg(course - f.heading_deg[at] - bearing))
+            if from_sight_deg < ACROSS_DEG:
+                return "away"
+            return "towards" if from_sight_deg > 180.0 - ACROSS_DEG else "across"
         case "target_motion":
             speed = f.target_speed_mps if at == _NOW else f.target_speeds_mps[at]
-            return None if speed is None else "standing" if speed < STANDING_MPS else "walking"
+            slow, fast, least_mps = "standing", "walking", STANDING_MPS
         case _:
             speed = f.mean_speed_mps if at == _NOW else f.speed_mps[at]
-            return None if speed is None else "hovering" if speed < HOVERING_MPS else "moving"
+            slow, fast, least_mps = "hovering", "moving", HOVERING_MPS
+    if speed is None:
+        return None
+    return slow if speed < least_mps else fast
 
 
 def _relation(reference: Reference, facts: Facts, at: int) -> str | None:
     """Return the word of a comparison, of a side at a frame, or of a turn's side or a trend over a span."""
     name, aspect, *_ = reference
-    quantity, ours, theirs = QUANTITIES[name], facts.mean_speed_mps, facts.target_speed_mps
     if aspect in ("comparison", "compared"):
-        if theirs is None or abs(ours - theirs) <= max(MATCHING_MPS, MATCHING_SHARE * theirs):
-            return None if theirs is None else "matching"
-        return "faster" if (ours > theirs) == (aspect == "comparison") else "slower"
+        return _compared_speed(facts.mean_speed_mps, facts.target_speed_mps, is_reversed=aspect == "compared")
+    quantity = QUANTITIES[name]
     values = _span(reference, facts)
     if aspect == "side":
-        is_offset = name in ("offset_x", "offset_y")
         value = _change(name, values) if name in TURNS else quantity.read(facts)[at]
-        return None if value is None else quantity.side_of(value, _centred_px(facts) if is_offset else quantity.steady)
+        dead_band = _centred_px(facts) if name in ("offset_x", "offset_y") else quantity.steady
+        return None if value is None else quantity.side_of(value, dead_band)
     if len(values) < 2:
         return None
     trend = trend_of(quantity, values)
     if has_sides(name) and trend in _REVERSED and min(values) < 0:
-        # Of the size: an offset to the left that shrinks is no increase.
+        # A trend is that of the size: an offset to the left that shrinks is no increase.
         return _REVERSED[trend] if max(values) <= 0 else None
     return trend
+
+
+def _compared_speed(drone_mps: float, target_mps: float | None, *, is_reversed: bool) -> str | None:
+    """Return how the drone's speed compares with the target's, reversed the other way round; None if not known."""
+    if target_mps is None:
+        return None
+    if abs(drone_mps - target_mps) <= max(MATCHING_MPS, MATCHING_SHARE * target_mps):
+        return "matching"
+    return "faster" if (drone_mps > target_mps) != is_reversed else "slower"
 
 
 def _over_span(reference: Reference, facts: Facts) -> float | None:
     """Return a number over a span, not rounded."""
     name, aspect, first, last = reference
     climb_mps = facts.velocity_mps[2]
-    whole = {
+    of_whole_window = {  # means of the straight line through all positions, not of its jitter
         "speed": facts.mean_speed_mps, "target_speed": facts.target_speed_mps,
         "climb_rate": climb_mps, "sink_rate": 0.0 - climb_mps,
     }  # fmt: skip
-    if aspect == "mean" and name in whole and first is last is None:
-        return whole[name]  # of the straight line through all positions, not of its jitter
+    if aspect == "mean" and name in of_whole_window and first is None and last is None:
+        return of_whole_window[name]
     values = _span(reference, facts)
     if values and aspect in ("mean", "min", "max"):
         return {"mean": sum(values) / len(values), "min": min(values), "max": max(values)}[aspect]
@@ -281,10 +297,10 @@ def has_sides(name: str) -> bool:
 
 
 def trend_of(quantity: Quantity, values: Sequence[float]) -> str:
-    """Name the course of a series: increasing, decreasing, steady or mixed.
+    """Return the trend of a series: increasing, decreasing, steady or mixed.
 
-    A course is a trend where the straight line that fits it best changes by more than the steady band and by
-    CLEAR_RATIO times the deviation from it.
+    It increases or decreases if all steps do, or if the straight line that fits it best changes by more than the steady
+    band and by more than CLEAR_RATIO times the deviation from that line.
     """
     band = max(quantity.steady, quantity.steady_share * max(map(abs, values)))
     if max(values) - min(values) <= band:
@@ -294,8 +310,10 @@ def trend_of(quantity: Quantity, values: Sequence[float]) -> str:
     norm = sum((i - middle) ** 2 for i in range(count))
     slope = sum((i - middle) * value for i, value in enumerate(values)) / norm
     deviation = math.sqrt(sum((value - mean - slope * (i - middle)) ** 2 for i, value in enumerate(values)) / count)
-    fitted, change = slope * (count - 1), values[-1] - values[0]
+    change = values[-1] - values[0]
+    change_of_line = slope * (count - 1)
     goes_one_way = all(change * (after - before) >= 0 for before, after in pairwise(values))
-    if change * fitted > 0 and (goes_one_way or abs(fitted) >= max(band, CLEAR_RATIO * deviation)):
+    is_clear = abs(change_of_line) >= max(band, CLEAR_RATIO * deviation)
+    if change * change_of_line > 0 and (goes_one_way or is_clear):
         return "increasing" if change > 0 else "decreasing"
     return "mixed"

@@ -15,8 +15,8 @@ from caption.verification.numerals import Numeral, read_numerals
 from cosfly.formats.captions import Language, ValueCounts
 from cosfly.geometry.axes import wrap_deg
 
-LONGEST = 500  # characters of a sentence that is read; a model that repeats itself ends none
-SHOWN = 80  # characters of a clause in a message
+MAX_SENTENCE = 500  # characters of a sentence that is read: a model that repeats itself never ends its sentence
+MAX_CLAUSE = 80  # characters of a clause in a message
 ABOUT_SHARE = 0.08  # by which an approximate number may miss its fact
 ABOUT_LEAST = {"m": 0.5, "mps": 0.1, "deg": 2.0, "dps": 1.0, "px": 4.0}
 BOUND_SHARE = 0.3  # "more than 20 m" is matched by 20 to 26 m
@@ -25,10 +25,10 @@ DIGITS = {"m": 1, "mps": 2, "deg": 1, "dps": 1, "px": 0}  # with which facts are
 
 
 class ValueCheck(NamedTuple):
-    """The values of one text. contradictions: a message for each contradicted value."""
+    """The values of one text."""
 
     counts: ValueCounts
-    contradictions: list[str]
+    contradictions: list[str]  # a message for each contradicted value
 
 
 def check_values(sentences: Sequence[str], facts: Facts, language: Language, filled: int = 0) -> ValueCheck:
@@ -41,7 +41,7 @@ def check_values(sentences: Sequence[str], facts: Facts, language: Language, fil
     is_hypothetical = mentions("hypothetical", "", language)
     contradictions: list[str] = []
     for sentence in sentences:
-        if len(sentence) > LONGEST:
+        if len(sentence) > MAX_SENTENCE:
             continue
         for numeral in read_numerals(sentence, language):
             clause = _clause_around(sentence, numeral, language)
@@ -51,10 +51,9 @@ def check_values(sentences: Sequence[str], facts: Facts, language: Language, fil
             if _matches_any(numeral, name, facts):
                 matched += 1
             else:
-                of = name.replace("_", " ") if name else "quantity"
-                contradictions.append(
-                    f'number: "{numeral.text.strip()}" in "{clause.strip()[:SHOWN]}" is no measured {of} of the window'
-                )
+                quantity = name.replace("_", " ") if name else "quantity"
+                quoted = f'"{numeral.text.strip()}" in "{clause.strip()[:MAX_CLAUSE]}"'
+                contradictions.append(f"number: {quoted} is no measured {quantity} of the window")
     counts = ValueCounts(values_filled=filled, values_matched=matched, values_contradicted=len(contradictions))
     return ValueCheck(counts, contradictions)
 
@@ -78,13 +77,14 @@ def named_quantity(clause: str, numeral: Numeral, language: Language) -> str:
     may give a difference.
     """
     if numeral.unit == "mps":
-        named, before = mentioned("subjects", clause, language), clause[: max(0, clause.find(numeral.text))]
-        if len(named) != 1 or not mentions("subjects", named[0], language).search(before):
+        subjects = mentioned("subjects", clause, language)
+        before = clause[: max(0, clause.find(numeral.text))]
+        if len(subjects) != 1 or not mentions("subjects", subjects[0], language).search(before):
             return ""
         compares = mentions("comparatives", "", language).search(clause) or len(read_numerals(clause, language)) > 1
-        return "" if compares else named[0]
-    named = mentioned("quantities", clause, language)
-    return named[0] if len(named) == 1 and (numeral.unit, named[0]) in _SERIES else ""
+        return "" if compares else subjects[0]
+    quantities = mentioned("quantities", clause, language)
+    return quantities[0] if len(quantities) == 1 and (numeral.unit, quantities[0]) in _SERIES else ""
 
 
 # --- what a number may be ---------------------------------------------------------------------------------------------
@@ -95,9 +95,9 @@ _SERIES: dict[tuple[str, str], Callable[[Facts], tuple[Series, ...]]] = {
     ("m", "altitude"): lambda f: (f.altitude_m, f.height_over_target_m),
     ("m", "distance"): lambda f: (
         f.distance_m, f.slant_m, f.travelled_m, f.displacement_m, f.target_travelled_m, f.other_distance_m,
-        [place and place[0] for place in f.place_m],
+        f.place_axis_m(0),
     ),
-    ("m", ""): lambda f: ([place and place[1] for place in f.place_m],),
+    ("m", ""): lambda f: (f.place_axis_m(1),),
     ("mps", "drone"): lambda f: (
         f.speed_mps, f.step_speeds_mps, f.climb_mps, (f.mean_speed_mps,), *[(speed,) for speed in f.velocity_mps],
     ),
@@ -120,42 +120,56 @@ def _series_of(name: str, unit: str, facts: Facts) -> list[Series]:
     return [series for key in keys for series in _SERIES[key](facts)]
 
 
-def _pool_of(name: str, unit: str, facts: Facts) -> tuple[set[float], set[float]]:
-    """Return what a number may be: the facts as printed, and means, differences and rates of them."""
-    if ("pool", name, unit) in facts.found:
-        return facts.found["pool", name, unit]  # type: ignore[no-any-return]
+class Pool(NamedTuple):
+    """The values that a number in a text may have."""
+
+    exact: set[float]  # the facts as printed
+    derived: set[float]  # means, differences and rates of them
+
+
+def _pool_of(name: str, unit: str, facts: Facts) -> Pool:
+    """Return the pool of a unit and a quantity; it is computed once per window."""
+    key = ("pool", name, unit)
+    if key not in facts.found:
+        facts.found[key] = _make_pool(name, unit, facts)
+    return facts.found[key]  # type: ignore[no-any-return]
+
+
+def _make_pool(name: str, unit: str, facts: Facts) -> Pool:
     exact: set[float] = set()
     derived: set[float] = set()
     for series in _series_of(name, unit, facts):
         known = [value for value in series if value is not None]
         exact.update(map(abs, known))
         derived.update(abs(b - a) for a, b in combinations(known, 2))
-        derived.update(
-            abs(sum(part) / len(part)) for start in range(len(known)) for part in (known[start:], known[: start + 1])
-        )
+        for i in range(len(known)):  # means from a frame on, and up to it
+            derived.add(abs(sum(known[i:]) / len(known[i:])))
+            derived.add(abs(sum(known[: i + 1]) / (i + 1)))
     if unit == "deg":
         derived |= {360.0 - angle for angle in derived}
-    for series in _series_of("", _RATE_OF[unit], facts) if unit in _RATE_OF else ():
-        for (i, a), (j, b) in combinations(enumerate(series), 2):
-            if a is not None and b is not None:
-                derived.add(abs(b - a) / ((j - i) * facts.step_s))
+    if unit in _RATE_OF:
+        for series in _series_of("", _RATE_OF[unit], facts):
+            for (i, a), (j, b) in combinations(enumerate(series), 2):
+                if a is not None and b is not None:
+                    derived.add(abs(b - a) / ((j - i) * facts.step_s))
     if not name:
         derived.update(_differences(unit, facts))
-    facts.found["pool", name, unit] = (exact, derived)
-    return exact, derived
+    return Pool(exact, derived)
 
 
 def _differences(unit: str, facts: Facts) -> Iterator[float]:
     """Yield by how much the drone and the target differ at the same time, in speed or heading."""
-    mean = (facts.target_speed_mps,) * len(facts)
-    pairs: dict[str, tuple[tuple[Series, Series], ...]] = {
+    mean_of_target = (facts.target_speed_mps,) * len(facts)
+    pairs: dict[str, tuple[tuple[Series, Series], ...]] = {  # of the drone, of the target
         "mps": (
-            (facts.speed_mps, facts.target_speeds_mps), (facts.step_speeds_mps, facts.target_step_speeds_mps),
-            (facts.step_speeds_mps, mean), ((facts.mean_speed_mps,) * len(facts), mean),
+            (facts.speed_mps, facts.target_speeds_mps),
+            (facts.step_speeds_mps, facts.target_step_speeds_mps),
+            (facts.step_speeds_mps, mean_of_target),
+            ((facts.mean_speed_mps,), mean_of_target[:1]),
             (facts.velocity_mps[:2], facts.target_velocity_mps or (None, None)),
         ),
         "deg": ((facts.heading_deg, facts.target_headings_deg),),
-    }  # fmt: skip
+    }
     for of_drone, of_target in pairs.get(unit, ()):
         for a, b in zip(of_drone, of_target, strict=True):
             if a is not None and b is not None:
@@ -163,14 +177,13 @@ def _differences(unit: str, facts: Facts) -> Iterator[float]:
 
 
 def _matches_any(numeral: Numeral, name: str, facts: Facts) -> bool:
-    size = (facts.width_px, facts.height_px)
-    if numeral.unit == "px" and numeral.value in (*size, size[0] / 2, size[1] / 2):
+    width_px, height_px = facts.width_px, facts.height_px
+    if numeral.unit == "px" and numeral.value in (width_px, height_px, width_px / 2, height_px / 2):
         return True
-    printed = 10.0 ** -DIGITS[numeral.unit]
-    exact, derived = _pool_of(name, numeral.unit, facts)
-    return any(_matches(numeral, fact, 0.5 * printed) for fact in exact) or any(
-        _matches(numeral, fact, printed) for fact in derived
-    )
+    last_digit = 10.0 ** -DIGITS[numeral.unit]
+    pool = _pool_of(name, numeral.unit, facts)
+    is_fact = any(_matches(numeral, fact, 0.5 * last_digit) for fact in pool.exact)
+    return is_fact or any(_matches(numeral, fact, last_digit) for fact in pool.derived)
 
 
 def _matches(numeral: Numeral, fact: float, rounding: float) -> bool:
@@ -191,8 +204,9 @@ def _matches(numeral: Numeral, fact: float, rounding: float) -> bool:
 
 
 def measured_lines(facts: Facts, contradictions: Sequence[str]) -> str:
-    """Return what was measured of the quantities that contradictions name, for the teacher to correct its text."""
-    lines = {
+    """Return what was measured of the quantities that contradictions name, for the teacher to correct its text; of all
+    quantities if they name none."""
+    quantities = {
         "altitude": ("altitude", facts.altitude_m, "m"),
         "distance": ("horizontal distance", facts.distance_m, "m"),
         "drone": ("drone speed", facts.speed_mps, "m/s"),
@@ -201,8 +215,9 @@ def measured_lines(facts: Facts, contradictions: Sequence[str]) -> str:
         "box": ("box height", facts.box_height_px, "px"),
         "offset": ("offset to the right of the image centre", facts.offset_x_px, "px"),
     }
-    named = [name for name in lines if any(f"measured {name} " in text for text in contradictions)] or list(lines)
-    return "; ".join(
-        f"{label}: {', '.join('-' if value is None else f'{value:g}' for value in series)} {unit}"
-        for label, series, unit in map(lines.__getitem__, named)
-    )
+    named = [name for name in quantities if any(f"measured {name} " in text for text in contradictions)]
+    lines = []
+    for label, series, unit in map(quantities.__getitem__, named or quantities):
+        values = ", ".join("-" if value is None else f"{value:g}" for value in series)
+        lines.append(f"{label}: {values} {unit}")
+    return "; ".join(lines)
