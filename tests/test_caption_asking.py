@@ -1,6 +1,7 @@
 """Runs of an endpoint teacher that stop, go on, retry and show what they do; and the book of answers."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from caption.stage.stage import run
 from caption.stage.trial import show_windows
 from cosfly.formats.captions import read_captions
 from cosfly.llm import client
+from cosfly.llm.answers import Budget, BudgetConfig
 from cosfly.runtime.errors import ConfigError, StorageError, TeacherError
 from specimens import make_playback_tree
 
@@ -217,6 +219,17 @@ def test_a_run_that_ends_early_counts_the_track_in_work_and_keeps_its_first_erro
     assert report_of(tmp_path / "out")["flights"] == {"input": 1, "kept": 1, "dropped": {}, "failed": {}}
 
 
+def test_windows_with_recorded_answers_say_nothing_about_the_time_that_is_left():
+    totals, shown = Counter[str](), list[str]()
+    progress = asking.RunProgress(lambda count, words: shown.append(words), 3, Budget(BudgetConfig(), 1, totals))
+    progress.add(None)
+    assert "0 answers in " in shown[-1]
+    assert " left" not in shown[-1]
+    totals["answers"] += 1
+    progress.add(None)
+    assert re.search(r"1 answers in .* windows/s, .* left", shown[-1])
+
+
 def test_a_trial_shows_questions_answers_and_outcomes_and_keeps_the_answers(tree, tmp_path):
     with deciding(fault=lambda index, body: "wrong_shape" if index == 0 else None) as server:
         lines = list(show_windows(settings(server.url), tree, tmp_path / "out", 1))
@@ -235,5 +248,12 @@ def test_a_trial_shows_questions_answers_and_outcomes_and_keeps_the_answers(tree
         text = "\n".join(show_windows(cfg, tree, tmp_path / "other", 2))
     assert text.count("--- outcome ---") == 2
     assert text.count("no answer: http_500") == 1
+    with deciding() as server:
+        server.text = lambda body: "The drone follows."
+        text = "\n".join(
+            show_windows(settings(server.url, endpoint={"json_schema": False}), tree, tmp_path / "prose", 1)
+        )
+    assert text.count(", no JSON object) ---") == 3
+    assert "fix: remove caption.endpoint.json_schema=false" in text
     with pytest.raises(ConfigError, match="asks no model"):
         list(show_windows(CaptionConfig(), tree, tmp_path / "out", 1))

@@ -290,8 +290,9 @@ class RunProgress:
         self.budget = budget
         self.windows = Tally()  # of this run
         self.num_repaired = 0
+        self._num_recorded = 0  # windows of this run before its first new answer: earlier answers sufficed
         self._start_s = time.monotonic()
-        self._tokens_before = budget.totals
+        self._totals_before = budget.totals
 
     def skip(self, num_windows: int) -> None:
         """Count windows of an earlier run."""
@@ -302,6 +303,8 @@ class RunProgress:
         """Count a caption, None for a window without an answer."""
         self.num_left -= 1
         self.windows.input += 1
+        if not self._answers["answers"]:
+            self._num_recorded += 1
         if caption is None or caption.drop_reason == "refused":
             self.windows.failed["no_answer"] += 1
         elif caption.status == "accepted":
@@ -315,21 +318,26 @@ class RunProgress:
         """Move the progress bar by so many windows, and update its text."""
         self._advance(num_windows, self.figures())
 
+    @property
+    def _answers(self) -> Counter[str]:
+        """The answers of this run and their tokens."""
+        return self.budget.totals - self._totals_before
+
     def figures(self) -> str:
         """Return the figures of the run as a text."""
-        budget, windows = self.budget, self.windows
-        tokens = budget.totals - self._tokens_before
+        prices, windows, answers = self.budget.cfg, self.windows, self._answers
         reasons = ", ".join(f"{reason} {count}" for reason, count in windows.dropped.most_common(4))
-        rate_per_s = windows.input / max(time.monotonic() - self._start_s, 1e-9)
+        elapsed_s = max(time.monotonic() - self._start_s, 1e-9)
         figures = [
             f"accepted {windows.kept:,} (repaired {self.num_repaired:,})",
             f"dropped {windows.dropped.total():,}" + (f" ({reasons})" if reasons else ""),
             f"no answer {windows.failed.total():,}",
-            f"tokens {tokens['prompt_tokens']:,} in {tokens['completion_tokens']:,} out",
-            f"{rate_per_s:.2f} windows/s",
+            f"{answers['answers']:,} answers in {duration(elapsed_s)}",
+            f"tokens {answers['prompt_tokens']:,} in {answers['completion_tokens']:,} out",
         ]
-        if budget.cfg.price_prompt or budget.cfg.price_completion:
-            figures.append(f"cost {budget.cfg.cost(tokens['prompt_tokens'], tokens['completion_tokens']):.2f}")
-        if windows.input:
-            figures.append(f"{duration(self.num_left / rate_per_s)} left")
+        if prices.price_prompt or prices.price_completion:
+            figures.append(f"cost {prices.cost(answers['prompt_tokens'], answers['completion_tokens']):.2f}")
+        if num_asked := windows.input - self._num_recorded:
+            figures.append(f"{num_asked / elapsed_s:.2f} windows/s")
+            figures.append(f"{duration(self.num_left * elapsed_s / num_asked)} left")
         return ", ".join(figures)

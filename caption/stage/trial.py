@@ -19,14 +19,17 @@ from caption.stage.window_loop import caption_window
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.students import student_settings
 from caption.teachers.teacher import EMBEDDED, AskingTeacher, open_teacher
-from cosfly.formats.captions import Caption
+from cosfly.formats.captions import FIELDS, Caption
 from cosfly.llm.answers import AnswerBook, Budget
 from cosfly.llm.contract import NoAnswer, Reply, Request, run_until_interrupted
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError, TeacherError
 from cosfly.runtime.escaping import LONGEST_LOG, for_terminal
+from cosfly.runtime.model_json import find_object
 
 log = logging.getLogger(__name__)
 
+# Reasons why an answer has no JSON object, in words.
+STRUCTURES = {"no_json_object": "no JSON object", "cut_short": "cut at caption.endpoint.max_tokens"}
 MOST_LOGGED = 200  # characters of an answer that are logged when it arrives
 
 
@@ -80,6 +83,8 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
             before = request.messages
         yield "--- outcome ---"
         yield from _outcome(outcome) if isinstance(outcome, Caption) else [f"no answer: {for_terminal(str(outcome))}"]
+        if isinstance(outcome, Caption) and outcome.drop_reason == "structure" and not cfg.endpoint.json_schema:
+            yield "fix: remove caption.endpoint.json_schema=false, so that the server enforces the fields"
 
 
 def _outcome(caption: Caption) -> Iterator[str]:
@@ -112,6 +117,8 @@ def _exchange(number: int, request: Request, reply: Reply, *, is_same: bool) -> 
                 num_pictures += 1
                 yield f"[picture {num_pictures}, {len(part['image_url']['url']) / 1e3:.0f} kB]"
     usage = reply.usage
-    tokens = f"{usage.prompt_tokens} tokens in, {usage.completion_tokens} out" if usage else "tokens not reported"
-    yield f"--- answer {number} ({tokens}) ---"
+    facts = [f"{usage.prompt_tokens} tokens in, {usage.completion_tokens} out" if usage else "tokens not reported"]
+    if reason := find_object(reply.text, FIELDS, reply.finish_reason).reason:
+        facts.append(STRUCTURES.get(reason, reason.replace("_", " ")))
+    yield f"--- answer {number} ({', '.join(facts)}) ---"
     yield for_terminal(reply.text, LONGEST_LOG)
