@@ -18,7 +18,7 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import dump_json, read_model
 from distill.evaluation import figures
 from distill.evaluation.figures import Answers, coc_of, measure, text_of
-from distill.evaluation.report import REPORT_FORMAT, Evaluation, notes_of, tables_of
+from distill.evaluation.report import REPORT_FORMAT, Evaluation, notes_of, summary_tables, tables_of
 from distill.evaluation.stage import Scorer, asked_samples, floors_of, majority, run
 from distill.inference.samples import make_prediction
 from distill.prepare.stage import PrepareConfig, make_sample
@@ -244,6 +244,9 @@ def test_without_an_encoder_the_report_says_so_and_gives_no_number(place):
     assert (teacher["accuracy_on_labels"].value, teacher["bertscore_f1"].value) == (1, None)
     assert report.students["one"].without_decision == {"broken_json": 2, "no_json_object": 2}
     assert "BERTScore of en was not computed, because no encoder was passed." in notes_of(report)
+    rows = {row[0]: row[1:] for row in summary_tables(path)[1].rows}
+    assert rows["one"][0].startswith("75.0%")
+    assert rows["one"][-1] == "-"
     assert len(report.examples) == 12
     again = run([place / "one"], place / "set", place / "again")
     for name in ("report.json", "evaluation.html"):

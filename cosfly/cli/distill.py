@@ -115,7 +115,10 @@ def evaluate(
     """Score and compare students: decisions, verdicts, BERTScore and values, with baselines and intervals."""
     folders = {"en": bertscore_en, "zh": bertscore_zh}
     encoders = {language: folder for language, folder in folders.items() if folder is not None}
-    job.run("distill.evaluation.stage", predictions, dataset, out, encoders=encoders, judged=judged or [])
+    product = job.call("distill.evaluation.stage", predictions, dataset, out, encoders=encoders, judged=judged or [])
+    for table in job.call("distill.evaluation.report:summary_tables", product):
+        options.print_table(table.columns, table.rows, table.title)
+    job.finish(product, out)
 
 
 FLYING = "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR; baselines: track_straight, random; ceiling: planner."

@@ -1,11 +1,12 @@
 """The report of an evaluation: `report.json`, and its tables as a page."""
 
+from pathlib import Path
 from typing import Any
 
 from cosfly.formats.captions import FIELDS, TOKENS, Coc, Language
 from cosfly.formats.episodes import Figure
 from cosfly.formats.predictions import Prediction, Split
-from cosfly.runtime.json_io import FileFormat, Record
+from cosfly.runtime.json_io import FileFormat, Record, read_model
 from cosfly.viz.page import page
 from cosfly.viz.tables import TextTable
 from distill.evaluation.figures import (
@@ -20,6 +21,7 @@ from distill.evaluation.figures import (
 )
 
 REPORT, REPORT_FORMAT = "report.json", FileFormat("cosfly.distill_report", "5.0", "report")
+SUMMARY = ("parsed", "accuracy", "accuracy_on_labels", "macro_f1", "bertscore_f1")  # figures for the terminal
 LANGUAGES: dict[Language, str] = {"en": "English", "zh": "Chinese"}
 # The paper's students: tab:distillation_summary, and the accuracies in the text of
 # sec:appendix_f_caption_distillation.
@@ -132,6 +134,17 @@ def tables_of(report: Evaluation, language: Language) -> list[TextTable]:
         found = {name: figure for name, figure in pairing.differences.items() if figure.value is not None}
         rows = [[FIGURES[name], _shown(name, figure, signed=True)] for name, figure in found.items()]
         tables.append(TextTable(f"{pairing.first} minus {pairing.second}", ["", "difference"], rows))
+    return tables
+
+
+def summary_tables(product: Path) -> list[TextTable]:
+    """Return the most important figures of a `report.json`, one table for each language."""
+    report = read_model(product, Evaluation, REPORT_FORMAT)
+    tables = []
+    for language, part in report.languages.items():
+        rows = [[name, *(_shown(key, own.figures[key]) for key in SUMMARY)] for name, own in part.who.items()]
+        title = f"{LANGUAGES[language]}: {part.samples} samples; all figures are in evaluation.html"
+        tables.append(TextTable(title, ["", *(FIGURES[key] for key in SUMMARY)], rows))
     return tables
 
 

@@ -6,6 +6,7 @@ as teachers are, with the prompts and pictures of the training.
 
 import asyncio
 import contextlib
+import logging
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -28,6 +29,8 @@ from distill.student.model import require, student_path, weight_files
 from distill.student.saving import check_adapter
 
 ANSWERS = "answers"  # the folder of journals
+
+log = logging.getLogger(__name__)
 
 
 def _with_model_name(cfg: InferConfig, url: str, out: Path) -> InferConfig:
@@ -112,6 +115,7 @@ def run(
     failed = Counter(failure.code for failure in failures)
     tally = Tally(input=len(outcomes), kept=len(outcomes) - len(failures), failed=failed)
     num_parsed = sum(prediction.coc is not None for prediction in predictions)
+    log.info("%d of %d answers have the three fields", num_parsed, len(predictions))
     facts = {"split": cfg.split, "has_adapter": adapter is not None, "model": name, "parsed": num_parsed}
     outputs = [out / PREDICTIONS, *sorted((out / ANSWERS).glob("*.jsonl"))]
     stage.finish(outputs, tally, **facts, speed=speed)
