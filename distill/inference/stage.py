@@ -18,7 +18,7 @@ from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Engine, started
 from cosfly.llm.vllm_engine import VllmEngine
 from cosfly.runtime.console import progress_bar
-from cosfly.runtime.errors import ConfigError, InputError, TeacherError
+from cosfly.runtime.errors import ConfigError, InputError, TeacherError, counts_text
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.run_dir import Failed, StageFolder, Tally, read_manifest, read_stage_record, write_failures
@@ -115,7 +115,9 @@ def run(
     failed = Counter(failure.code for failure in failures)
     tally = Tally(input=len(outcomes), kept=len(outcomes) - len(failures), failed=failed)
     num_parsed = sum(prediction.coc is not None for prediction in predictions)
-    log.info("%d of %d answers have the three fields", num_parsed, len(predictions))
+    reasons = Counter(prediction.reason for prediction in predictions if prediction.reason)
+    causes = f" ({counts_text(reasons)})" if reasons else ""
+    log.info("%d of %d answers parse%s", num_parsed, len(predictions), causes)
     facts = {"split": cfg.split, "has_adapter": adapter is not None, "model": name, "parsed": num_parsed}
     outputs = [out / PREDICTIONS, *sorted((out / ANSWERS).glob("*.jsonl"))]
     stage.finish(outputs, tally, **facts, speed=speed)
