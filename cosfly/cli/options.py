@@ -360,9 +360,10 @@ def print_table(
     rows = list(rows)
     for number, name in enumerate(head):
         is_left = number == 0 or name in left
-        # A heading breaks at spaces alone, and a number nowhere: a table may be wider than the terminal.
-        whole = [*name.split(), *(() if is_left else (str(row[number]) for row in rows))]
-        least = max(map(len, whole), default=0)
+        # Headings and names break at spaces alone, numbers nowhere: a table may be wider than the terminal.
+        cells = [str(row[number]) for row in rows]
+        names = " ".join([name, *cells] if number == 0 else [name]).split()
+        least = max(map(len, names if is_left else [*names, *cells]), default=0)
         table.add_column(name, justify="left" if is_left else "right", overflow="fold", min_width=least)
     for row in rows:
         table.add_row(*row)
