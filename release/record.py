@@ -259,13 +259,10 @@ def numbers_of_splits(
     for split in SPLIT_NAMES:
         if in_split := [track for track in tracks if track.split == split]:
             numbers[split] = SplitNumbers(
-                frames=sum(track.frames for track in in_split),
-                captions=captions.get(split, 0),
-                flights=len(in_split),
+                frames=sum(track.frames for track in in_split), captions=captions.get(split, 0), flights=len(in_split),
                 trajectories=len({track.trajectory for track in in_split}),
-                walks=sorted({track.walk for track in in_split}),
-                towns=sorted({track.town for track in in_split}),
-            )
+                walks=sorted({track.walk for track in in_split}), towns=sorted({track.town for track in in_split}),
+            )  # fmt: skip
     return numbers
 
 

@@ -78,14 +78,12 @@ def compare(strategy: Strategy, trials: Sequence[Trial]) -> Comparison:
     repaired = [(trial.first, trial.last) for trial in trials if trial.last is not None]
     consistent = sum(trial.last is not None and trial.verdict == "CONSISTENT" for trial in trials)
     return Comparison(
-        strategy=strategy,
-        num_conflicts=len(trials),
-        repaired=len(repaired),
+        strategy=strategy, num_conflicts=len(trials), repaired=len(repaired),
         consistency=round(consistent / len(trials), 3),
         naturalness=round(fmean(itertools.starmap(words_in_common, repaired)), 3) if repaired else None,
         asks_per_conflict=round(fmean(trial.asks for trial in trials), 3),
         tokens_per_conflict=round(fmean(trial.tokens for trial in trials), 1),
-    )
+    )  # fmt: skip
 
 
 def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: int = 50) -> list[Comparison]:

@@ -78,19 +78,12 @@ def observe(
     """
     goal, current = track.goal, span.stop - 1
     return ObservedWindow(
-        sample_id=sample_id(track.flight_id, current),
-        town=track.town,
-        trajectory=track.trajectory,
-        variant=track.variant,
-        indices=tuple(range(span.start, span.stop)),
-        width_px=track.camera.width_px,
-        height_px=track.camera.height_px,
-        frames=frames[span],
-        frame_folders=tuple(folders[span]),
-        frame_files=tuple(files[span]),
-        mission=order,
+        sample_id=sample_id(track.flight_id, current), town=track.town, trajectory=track.trajectory,
+        variant=track.variant, indices=tuple(range(span.start, span.stop)), width_px=track.camera.width_px,
+        height_px=track.camera.height_px, frames=frames[span], frame_folders=tuple(folders[span]),
+        frame_files=tuple(files[span]), mission=order,
         goal=None if goal is None or track.bystanders is None else {"en": goal.en, "zh": goal.zh},
-    )
+    )  # fmt: skip
 
 
 def order_comes_within(mission: Mission | None, current: int, future_frames: int) -> bool:
@@ -108,16 +101,11 @@ def cut_future(track: Track, motion: LabelMotion, current: int, future_frames: i
     step_s = track.time_s[current] - track.time_s[current - 1]
     before_m, now_m = motion.positions_m[current - 1 : current + 1].tolist()
     return FutureMotion(
-        indices=tuple(range(current + 1, current + future_frames + 1)),
-        time_s=track.time_s[span],
-        positions_m=motion.positions_m[span],
-        yaw_deg=motion.yaw_deg[span],
-        targets_m=motion.targets_m[span],
-        visible=track.target.visible[span],
-        speed_before_mps=math.dist(now_m, before_m) / float(step_s),
-        label_from=motion.label_from,
-        order=None if track.mission is None else track.mission.order_at(current),
-    )
+        indices=tuple(range(current + 1, current + future_frames + 1)), time_s=track.time_s[span],
+        positions_m=motion.positions_m[span], yaw_deg=motion.yaw_deg[span], targets_m=motion.targets_m[span],
+        visible=track.target.visible[span], speed_before_mps=math.dist(now_m, before_m) / float(step_s),
+        label_from=motion.label_from, order=None if track.mission is None else track.mission.order_at(current),
+    )  # fmt: skip
 
 
 # --- the motion that labels come from ---------------------------------------------------------------------------------

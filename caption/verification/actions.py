@@ -73,21 +73,15 @@ def measure(future: FutureMotion) -> Motion:
     x0, y0 = first_x - first_target_x, first_y - first_target_y
     x1, y1 = last_x - last_target_x, last_y - last_target_y
     return Motion(
-        yaw_deg=sum([(b - a + 180.0) % 360.0 - 180.0 for a, b in pairwise(yaw_deg)]),
-        altitude_m=last_z - first_z,
-        mean_speed_mps=mean_speed_mps,
-        speed_change_mps=mean_speed_mps - future.speed_before_mps,
-        forward_gain_mps=forward_m / duration_s - future.speed_before_mps,
-        forward_m=forward_m,
-        left_m=moved_y * cos - moved_x * sin,
-        approach_m=math.hypot(x0, y0) - math.hypot(x1, y1),
+        yaw_deg=sum([(b - a + 180.0) % 360.0 - 180.0 for a, b in pairwise(yaw_deg)]), altitude_m=last_z - first_z,
+        mean_speed_mps=mean_speed_mps, speed_change_mps=mean_speed_mps - future.speed_before_mps,
+        forward_gain_mps=forward_m / duration_s - future.speed_before_mps, forward_m=forward_m,
+        left_m=moved_y * cos - moved_x * sin, approach_m=math.hypot(x0, y0) - math.hypot(x1, y1),
         closing_m=math.hypot(x0, y0) - math.hypot(last_x - first_target_x, last_y - first_target_y),
         sweep_deg=-math.degrees(math.atan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1)),
         target_path_m=math.hypot(last_target_x - first_target_x, last_target_y - first_target_y),
-        visible_now=visible[0],
-        visible_share=sum(visible[1:]) / (len(visible) - 1),
-        order=future.order,
-    )
+        visible_now=visible[0], visible_share=sum(visible[1:]) / (len(visible) - 1), order=future.order,
+    )  # fmt: skip
 
 
 Measure = Callable[[Motion], float]

@@ -223,13 +223,10 @@ def _history(plan: ReleasePlan, tracks: list[Chosen]) -> History:
         without_caption.update(track.captions.why_none(i) for i in {*track.selected} - {*track.captioned})
     num_released = sum(len(track.captioned) for track in tracks)
     captions = CaptionHistory(
-        read=account.accepted + account.dropped.total(),
-        dropped=dict(sorted(account.dropped.items())),
-        released=num_released,
-        frame_not_selected=sum(len(track.captions.spans) for track in tracks) - num_released,
-        flight_left_out=account.of_other_tracks,
-        frames_without=dict(sorted(without_caption.items())),
-    )
+        read=account.accepted + account.dropped.total(), dropped=dict(sorted(account.dropped.items())),
+        released=num_released, frame_not_selected=sum(len(track.captions.spans) for track in tracks) - num_released,
+        flight_left_out=account.of_other_tracks, frames_without=dict(sorted(without_caption.items())),
+    )  # fmt: skip
     flights = FlightHistory(
         found=len(plan.material.candidates), inspected=plan.material.num_inspected, released=len(tracks),
         left_out=dict(sorted(plan.dropped.items())),

@@ -60,17 +60,12 @@ def shown_caption(row: Row) -> ShownCaption:
     """Return the caption of a row. Raises KeyError and TypeError if a part of it is missing, which `check_captions`
     reports."""
     return ShownCaption(
-        sample_id=row["sample_id"],
-        frame_index=row["frame_index"],
-        window=row[WINDOW] or [],
+        sample_id=row["sample_id"], frame_index=row["frame_index"], window=row[WINDOW] or [],
         picture_px=tuple(row[PICTURE_PX]),
         prompts={language: row[f"prompt_{language}"] for language in LANGUAGES if row.get(f"prompt_{language}")},
         texts={language: {name: row[f"caption_{language}_{name}"] for name in FIELDS} for language in LANGUAGES},
         writing=row["writing"],
         values={language: tuple(row[f"{name}_{language}"] for name in VALUES) for language in LANGUAGES},
-        evidence=row["evidence"],
-        decision=row["decision"],
-        repair=row["repair_strategy"],
-        label=row["label"],
+        evidence=row["evidence"], decision=row["decision"], repair=row["repair_strategy"], label=row["label"],
         verdict=row["verdict"],
-    )
+    )  # fmt: skip
