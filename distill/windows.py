@@ -162,14 +162,12 @@ class WindowDataset(Sequence[WindowData]):
         sentence = Pictures(("rgb",), (picture_px[0], picture_px[1])).sentence(language)
         caption = {field: last[f"caption_{language}_{field}"] or "" for field in FIELDS}
         return WindowData(
-            sample_id=place.sample_id,
-            flight="/".join(place.flight),
-            window=np.array(place.window, dtype=np.int64),
+            sample_id=place.sample_id, flight="/".join(place.flight), window=np.array(place.window, dtype=np.int64),
             frames=np.ascontiguousarray(np.stack(frames).transpose(0, 3, 1, 2)),
             facts={name: _column(rows, name) for name in FACTS},
             prompt=Prompt(system=system, user=user).told(sentence).model_dump(),
             caption=caption | {name: last[name] or "" for name in ("label", "verdict")},
-        )
+        )  # fmt: skip
 
 
 def _column(rows: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:

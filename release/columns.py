@@ -1,8 +1,8 @@
-"""The columns of the released parquet files: one table that says all there is to say of a column.
+"""The columns of the released parquet files, as one table.
 
 A new column is one row of FRAME or CAPTION: its type, the values that it may hold, the field that it is taken from, and
-how the card counts it. Schema, rows, card and `release verify` follow. Lists are flat, so that every
-reader of parquet shows plain columns.
+how the card counts it. Schema, rows, card and `release verify` follow from it. Lists are flat, so that every reader of
+parquet shows plain columns.
 """
 
 import math
@@ -17,12 +17,7 @@ import numpy as np
 import pyarrow as pa
 
 from cosfly.formats.captions import FIELDS, Caption, LabelFrom, Language, TeacherKind, ValueCounts, Verdict, Writing
-from cosfly.formats.frames import (
-    LEAST_FOV_DEG,
-    MOST_FOV_DEG,
-    PERSON_ID,
-    FrameFile,
-)
+from cosfly.formats.frames import LEAST_FOV_DEG, MOST_FOV_DEG, PERSON_ID, FrameFile
 from cosfly.formats.places import sample_id
 from cosfly.formats.playback import EVENTS, Track
 from cosfly.formats.weather import WeatherMode, WeatherParams
@@ -60,70 +55,66 @@ LISTS = {"indices": "int32", "texts": "string", "numbers": "float64"}  # types t
 
 @dataclass(frozen=True)
 class Placement:
-    """What the rows of a track say of its place in the release: the columns of these names.
-
-    pair: the name of its twin in the records, None where that is not released.
-    """
+    """The place of a track in the release: its rows have these values in the columns of these names."""
 
     walk: str
     split: SplitName
-    pair: str | None = None
+    pair: str | None = None  # the name of its twin in the records, None if that is not released
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column.
-
-    type: a type of `datasets.Value`, "image", "events", one of LISTS, or the members of a struct of numbers.
-    of_frame: its value at frame i of a track; of_caption: its value of the frame's caption, null where there is none.
-    NaN becomes null. Without either it is a picture, which the writer reads, or a field of Placement.
-    words: those that it may hold, empty: any; "actions": the decisions of the release. ranges: of its numbers, by
-    member ("" where it has none).
-    required: it is null in no row (of a caption's: in no row with a caption). constant: it does not change within a
-    track.
-    title: what the card calls it, which counts the captions by its values; empty: it does not.
-    """
+    """One column. Its value is that of a frame or of the frame's caption, if it has one; NaN becomes null. Without
+    `of_frame` and `of_caption` it is a picture, which the writer reads, or a field of Placement."""
 
     name: str
+    # A type of `datasets.Value`, "image", "events", one of LISTS, or the members of a struct of numbers.
     type: str | tuple[str, ...]
-    of_frame: Callable[[Track, int], Any] | None = None
+    of_frame: Callable[[Track, int], Any] | None = None  # returns the value at frame i of a track
     of_caption: Callable[[Caption], Any] | None = None
-    words: tuple[str, ...] | Literal["actions"] = ()
-    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    required: bool = False
-    constant: bool = False
-    title: str = ""
+    words: tuple[str, ...] | Literal["actions"] = ()  # allowed ones; empty: any; "actions": decisions of the release
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # of its numbers, by member ("" if none)
+    required: bool = False  # null in no row; if it is of captions, in no row with a caption
+    constant: bool = False  # does not change within a track
+    title: str = ""  # heading in the card, which counts the captions by its values; empty: it does not
 
     def cell(self, track: Track, i: int, caption: ReleasedCaption | None, placement: Placement) -> Any:
+        """Return the value in the row of a frame."""
         value: Any
         if self.of_caption is not None:
             value = None if caption is None else caption[self.name]
+        elif self.of_frame is not None:
+            value = self.of_frame(track, i)
         else:
-            value = getattr(placement, self.name) if self.of_frame is None else self.of_frame(track, i)
-        if isinstance(self.type, tuple):  # of few numbers Python's own are faster than an array
-            numbers = [] if value is None else value.tolist()
-            is_null = not numbers or any(map(math.isnan, numbers))
-            return None if is_null else {name: x + 0.0 for name, x in zip(self.type, numbers, strict=True)}  # no -0.0
+            value = getattr(placement, self.name)
+        if isinstance(self.type, tuple):
+            numbers = [] if value is None else value.tolist()  # for a few numbers faster than an array
+            if not numbers or any(map(math.isnan, numbers)):
+                return None
+            return {name: x + 0.0 for name, x in zip(self.type, numbers, strict=True)}  # + 0.0: no negative zero
         if self.type == "numbers":
             return None if np.isnan(value).any() else (value.ravel() + 0.0).tolist()
         if self.type == "float64":
             return None if value is None or math.isnan(value) else float(value)
-        return bool(value) if self.type == "bool" and (value is not None or self.required) else value
+        if self.type == "bool" and (value is not None or self.required):
+            return bool(value)
+        return value
 
 
-def _knobs(track: Track) -> np.ndarray | None:
-    """Return the six knobs of weather, (6,), None where the file has none."""
+def _weather_params(track: Track, i: int) -> np.ndarray | None:
+    """Return WEATHER_PARAMS, (6,), None if the file of the track has none."""
     record = track.weather_record
     return None if record is None else np.array([getattr(record.params, name) for name in WEATHER_PARAMS])
 
 
-def _of_company(k: int, track: Track, i: int) -> int | None:
+def _goal(name: str, track: Track, i: int) -> Any:
+    return None if track.goal is None else getattr(track.goal, name)
+
+
+def _bystander_number(k: int, track: Track, i: int) -> int | None:
+    """Return a whole number about the other people: column k of `bystanders`, as COMPANY_COLUMNS."""
     value = math.nan if track.bystanders is None else track.bystanders[i, k]
     return None if math.isnan(value) else int(value)
-
-
-def _repair(caption: Caption) -> str | None:
-    return caption.repair.strategy if caption.repair else None
 
 
 def _decision(caption: Caption) -> str | None:
@@ -131,12 +122,10 @@ def _decision(caption: Caption) -> str | None:
     return None if coc is None else coc.flight_decision
 
 
-def _values(column: str, caption: Caption) -> int | None:
-    name, _, language = column.rpartition("_")
-    for counted, counts in (caption.checks.values or {}).items():
-        if counted == language:
-            return getattr(counts, name)
-    return None
+def _num_values(name: str, language: Language, caption: Caption) -> int | None:
+    """Return a field of ValueCounts of the text in a language, None if its values were not counted."""
+    counts = (caption.checks.values or {}).get(language)
+    return None if counts is None else getattr(counts, name)
 
 
 def _text(language: Language, name: str, caption: Caption) -> str | None:
@@ -160,7 +149,7 @@ PICTURES: dict[FrameFile, Column] = {
 }
 
 
-NONE_TO_ONE = {"": (0.0, 1.0)}
+ZERO_TO_ONE = {"": (0.0, 1.0)}
 PIXELS = {"": (1, 100_000)}
 FRAME = (  # everything of a frame but pictures and depth
     Column("sample_id", "string", lambda f, i: sample_id(f.flight_id, i), required=True),
@@ -178,20 +167,20 @@ FRAME = (  # everything of a frame but pictures and depth
     Column("walk", "string", constant=True),
     Column("split", "string", constant=True),
     Column("pair", "string", constant=True),
-    Column("people", "string", lambda f, i: f.people and dump_json(asdict(f.people)), constant=True),
-    Column("goal_en", "string", lambda f, i: f.goal and f.goal.en, constant=True),
-    Column("goal_zh", "string", lambda f, i: f.goal and f.goal.zh, constant=True),
-    Column("goal_says", "texts", lambda f, i: f.goal and list(f.goal.says), constant=True),
-    Column("goal_frame", "int32", lambda f, i: f.goal and f.goal.frame, constant=True),
+    Column("people", "string", lambda f, i: dump_json(asdict(f.people)) if f.people else None, constant=True),
+    Column("goal_en", "string", partial(_goal, "en"), constant=True),
+    Column("goal_zh", "string", partial(_goal, "zh"), constant=True),
+    Column("goal_says", "texts", lambda f, i: list(f.goal.says) if f.goal else None, constant=True),
+    Column("goal_frame", "int32", partial(_goal, "frame"), constant=True),
     Column(TARGET_PICTURE, "image", lambda f, i: f.target_picture(i)),
     Column("weather", "string", lambda f, i: f.weather["weather"], constant=True),
     Column("time_of_day", "string", lambda f, i: f.weather["time_of_day"], constant=True),
     Column(
-        "weather_mode", "string", lambda f, i: f.weather_record and f.weather_record.mode, words=get_args(WeatherMode),
-        constant=True,
+        "weather_mode", "string", lambda f, i: f.weather_record.mode if f.weather_record else None,
+        words=get_args(WeatherMode), constant=True,
     ),
     Column(
-        "weather_params", WEATHER_PARAMS, lambda f, i: _knobs(f), constant=True,
+        "weather_params", WEATHER_PARAMS, _weather_params, constant=True,
         ranges={
             **dict.fromkeys(("cloudiness", "precipitation", "fog_density"), (0.0, 100.0)), "fog_distance": (1e-9, 1e6),
             "sun_altitude_angle": (-90.0, 90.0), "sun_azimuth_angle": (0.0, 360.0),
@@ -225,18 +214,18 @@ FRAME = (  # everything of a frame but pictures and depth
     Column("target_depth_m", "float64", lambda f, i: f.target.depth_m[i]),
     Column("target_in_view", "bool", lambda f, i: f.target.in_view[i], required=True),
     Column("target_visible", "bool", lambda f, i: f.target.visible[i], required=True),
-    Column("visibility", "float64", lambda f, i: f.target.visibility[i], ranges=NONE_TO_ONE),
+    Column("visibility", "float64", lambda f, i: f.target.visibility[i], ranges=ZERO_TO_ONE),
     Column("target_height_px", "float64", lambda f, i: f.legibility_at(i)["height_px"], ranges={"": (0.0, 100_000.0)}),
     Column("target_contrast", "float64", lambda f, i: f.legibility_at(i)["contrast"], ranges={"": (0.0, 300.0)}),
     Column("target_legible", "bool", lambda f, i: f.legibility_at(i)["legible"]),
-    Column("others_in_view", "int32", partial(_of_company, 0)),
+    Column("others_in_view", "int32", partial(_bystander_number, 0)),
     Column(
         "other_distance_m", "float64", lambda f, i: None if f.bystanders is None else f.bystanders[i, 1],
         ranges={"": (0.0, 1e6)},
     ),
-    Column("other_id", "int32", partial(_of_company, 2), ranges={"": (0, PERSON_ID)}),
-    Column("alike_id", "int32", partial(_of_company, 3), ranges={"": (0, PERSON_ID)}),
-    Column("alike_differences", "int32", partial(_of_company, 4)),
+    Column("other_id", "int32", partial(_bystander_number, 2), ranges={"": (0, PERSON_ID)}),
+    Column("alike_id", "int32", partial(_bystander_number, 3), ranges={"": (0, PERSON_ID)}),
+    Column("alike_differences", "int32", partial(_bystander_number, 4)),
     Column("is_perturbed", "bool", lambda f, i: f.perturbation.is_perturbed[i], required=True),
     Column("perturbation", "events", lambda f, i: f.events(i)),
     Column(
@@ -262,8 +251,8 @@ CAPTION = (  # what a row holds of an accepted caption, and nulls where there is
         "verdict", "string", of_caption=lambda c: c.verdict, words=get_args(Verdict), required=True,
         title="verdict against the geometry",
     ),
-    Column("repair_strategy", "string", of_caption=_repair, title="repair"),
-    Column("repair_rung", "string", of_caption=lambda c: c.repair and c.repair.rung, title="repaired by"),
+    Column("repair_strategy", "string", of_caption=lambda c: c.repair.strategy if c.repair else None, title="repair"),
+    Column("repair_rung", "string", of_caption=lambda c: c.repair.rung if c.repair else None, title="repaired by"),
     Column(
         "teacher_kind", "string", of_caption=lambda c: c.teacher.kind, words=get_args(TeacherKind), required=True,
         title="kind of teacher",
@@ -277,7 +266,8 @@ CAPTION = (  # what a row holds of an accepted caption, and nulls where there is
         title="written as",
     ),
     *(  # numbers with a unit, and relations that fill slots; nothing else of a text is checked
-        Column(name, "int32", of_caption=partial(_values, name)) for name in VALUE_COLUMNS
+        Column(f"{name}_{language}", "int32", of_caption=partial(_num_values, name, language))
+        for language in LANGUAGES for name in VALUES
     ),
     *(
         Column(
@@ -342,14 +332,14 @@ def points_schema() -> pa.Schema:
 def _schema(names: tuple[str, ...]) -> pa.Schema:
     from datasets import Features, Image, List, Value  # it takes a second and more to import
 
-    def feature(kind: str | tuple[str, ...]) -> Any:
-        if isinstance(kind, tuple):
-            return {member: Value("float64") for member in kind}
-        if kind == "events":
+    def feature(column_type: str | tuple[str, ...]) -> Any:
+        if isinstance(column_type, tuple):
+            return {member: Value("float64") for member in column_type}
+        if column_type == "events":
             return {event: Value("string") for event in EVENTS}
-        if kind == "image":
+        if column_type == "image":
             return Image()
-        return List(Value(LISTS[kind])) if kind in LISTS else Value(kind)
+        return List(Value(LISTS[column_type])) if column_type in LISTS else Value(column_type)
 
     types = {column.name: column.type for column in (*PICTURES.values(), *SCALARS)}
     return Features({name: feature(types[name]) for name in names}).arrow_schema
@@ -376,10 +366,10 @@ def track_name(place: Place) -> str:
 # --- published names --------------------------------------------------------------------------------------------------
 
 ADDRESS = re.compile(r"[A-Za-z][\w+.-]*://[^\s,;'\"]*")
-# From the root, a home or a drive; behind letters (`and/or`) it is no path.
+# A path in a text: from the root, a home or a drive. Behind letters (`and/or`) a slash begins no path.
 ABSOLUTE = re.compile(r"(?<![\w.])(?:~|[A-Za-z]:)?[\\/][^\s,;'\"]*")
 IS_ABSOLUTE = re.compile(r"~|[\\/]|[A-Za-z]:[\\/]")
-# One slash: a name on the hub.
+# A text that is a path: `./a`, `a/b/c`, `a\b`; with one slash it is a name on the hub.
 RELATIVE = re.compile(r"\.{1,2}[\\/]\S*|[\w.-]+(?:[\\/][\w.-]+){2,}[\\/]?|[\w.-]+\\[\w.-]+")
 
 
@@ -401,4 +391,5 @@ def published(value: Any) -> Any:
 
 
 def _last_name(path: str) -> str:
+    """Return the last part of a path that is a name, not `..` or `~`."""
     return next((part for part in reversed(re.split(r"[\\/]", path)) if part.strip("~.")), "a path")

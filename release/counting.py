@@ -1,4 +1,4 @@
-"""What is counted in one pass over the rows of a release: each track, and the numbers of the release, which add it up.
+"""Counts of a release from one pass over its rows: those of each track, and the numbers of the release, their sums.
 
 Card, statistics and `release verify` use them. Motion is the plan's: positions minus the recorded offsets, over all
 points, so that a perturbed track counts as its clean one does. Sums are of whole millionths, so they are exact and the
@@ -24,7 +24,7 @@ from release.columns import CAPTION_FIELDS, COUNTED, LANGUAGES, VALUE_COLUMNS
 from release.reading import TrackRows, bounded, read_tracks
 from release.record import Counts, Numbers, Shard, Spread
 
-DIGITS = 4
+DIGITS = 4  # of a number in the record
 MILLION = 1_000_000
 LEAST_STEP_S = 1e-3  # between two points
 SAME_FOV_DEG = 0.05
@@ -32,11 +32,12 @@ REVIEW_BELOW = 0.5  # of the smoothness score (sec:step6)
 HOVER_MPS, TURN_DEGPS = 0.3, 5.0  # an action that is slower is hover; one that turns faster is a turn
 MOVES = (("forward", "backward"), ("left", "right"), ("up", "down"))  # by the sign of the velocities of an action
 ACTION_CLASSES = (*(name for pair in MOVES for name in pair), "turn left", "turn right", "hover")
-POOLED = ("height_m", "distance_m", "visibility")
+POOLED = ("height_m", "distance_m", "visibility")  # sums over all frames of the release
 TAB = "\t"  # between the names of a pair that is counted
 # Columns of yes and no whose frames are counted.
 FLAGS = ("is_perturbed", "target_in_view", "target_visible", "target_legible", "has_caption")
-STATES = ("unperturbed", "position only", "rotation only", "full")  # number: 1 for a shift, 2 for a turn
+STATES = ("unperturbed", "position only", "rotation only", "full")  # index: 1 for a shift plus 2 for a turn
+# Columns that are read.
 COLUMNS = (
     "sample_id", "track", "split", "walk", "pair", "style", "pace", "weather", "time_of_day", "frame_index", "width_px",
     "height_px", "fov_deg", "intrinsics", "pose", "drone_offset", "target", "target_offset", "target_heading_deg",
@@ -46,12 +47,12 @@ COLUMNS = (
 
 
 class Sum(BaseModel):
-    """Count, exact sums in whole millionths, least and greatest of values."""
+    """Sums of values, exact, because they are in whole millionths."""
 
     count: int = 0
-    total: int = 0
-    squares: int = 0
-    low: int | None = None
+    total: int = 0  # sum of the values
+    squares: int = 0  # sum of their squares, in millionths of millionths
+    low: int | None = None  # least value
     high: int | None = None
 
     @classmethod
@@ -86,26 +87,21 @@ class Sum(BaseModel):
 
 
 class TrackCount(BaseModel):
-    """The counts of one track.
-
-    frames_digest: Of the indices of its frames. fov: Its field of view in degrees, or `changing`.
-    motion: Duration, length, acceleration and jerk without perturbation, None where that is not known.
-    sums: Over its frames. counts: Of the frames by a value of what the key names; pairs of values are joined by TAB.
-    """
+    """The counts of one track."""
 
     name: str
-    track: str
+    track: str  # clean or perturbed
     split: str | None
     walk: str | None
     pair: str | None
     frames: int
     points: int
-    frames_digest: str
-    fov: str
-    motion: dict[str, float | None]
-    sums: dict[str, Sum]
-    counts: dict[str, Counts]
-    example: dict[str, str | None]
+    frames_digest: str  # of the indices of its frames
+    fov: str  # its field of view in degrees, or `changing`
+    motion: dict[str, float | None]  # duration, length, acceleration and jerk without perturbation, None if not known
+    sums: dict[str, Sum]  # over its frames
+    counts: dict[str, Counts]  # what is counted -> frames by its value; pairs of values are joined by TAB
+    example: dict[str, str | None]  # its first caption
 
     @property
     def town(self) -> str:
@@ -130,18 +126,19 @@ def frames_digest(indices: np.ndarray) -> str:
 def count_track(frames: TrackRows, points: TrackRows) -> TrackCount:
     """Count the rows of a track, n frames. Raise InputError where a number is out of range."""
     first, rows = frames.rows[0], frames.rows
-    offsets_m = frames.pose[:, :3] - frames.target_m
-    clean_m = offsets_m - frames.drone_offset[:, :3] + frames.target_offset
+    to_drone_m = frames.pose[:, :3] - frames.target_m
+    clean_m = to_drone_m - frames.drone_offset[:, :3] + frames.target_offset  # without perturbation
     fovs = frames.numbers("fov_deg")
     is_zooming = bool((np.abs(fovs - fovs[0]) > SAME_FOV_DEG).any())
     captioned = [row for row in rows if row["has_caption"]]
-    texts = {name: [row[name] or "" for row in captioned] for name in CAPTION_FIELDS}
     measured = {
-        "height_m": offsets_m[:, 2], "distance_m": np.linalg.norm(offsets_m, axis=1),
-        "clean_altitude_m": clean_m[:, 2] + TARGET_HEIGHT_M, "clean_distance_m": np.linalg.norm(clean_m, axis=1),
+        "height_m": to_drone_m[:, 2],
+        "distance_m": np.linalg.norm(to_drone_m, axis=1),
+        "clean_altitude_m": clean_m[:, 2] + TARGET_HEIGHT_M,
+        "clean_distance_m": np.linalg.norm(clean_m, axis=1),
         "visibility": frames.visibility,
-        **{name: np.array([len(text) for text in own], float) for name, own in texts.items()},
-    }  # fmt: skip
+        **{name: np.array([len(row[name] or "") for row in captioned], float) for name in CAPTION_FIELDS},
+    }
     return TrackCount(
         name=frames.name, **{name: first[name] for name in ("track", "split", "walk", "pair")}, frames=len(rows),
         points=len(points), frames_digest=frames_digest(frames.index),
@@ -154,57 +151,65 @@ def count_track(frames: TrackRows, points: TrackRows) -> TrackCount:
 
 def _motion(points: TrackRows) -> dict[str, float | None]:
     """Return duration, length, and RMS acceleration and jerk of the motion without perturbation."""
-    clean_m, steps_s = points.pose[:, :3] - points.drone_offset[:, :3], np.diff(points.time_s)
-    found: dict[str, float | None] = {"duration_s": bounded(float(points.time_s[-1] - points.time_s[0]))}
-    found |= dict.fromkeys(("length_m", "accel_rms_mps2", "jerk_rms_mps3"))
+    clean_m = points.pose[:, :3] - points.drone_offset[:, :3]
+    steps_s = np.diff(points.time_s)
+    motion: dict[str, float | None] = {"duration_s": bounded(float(points.time_s[-1] - points.time_s[0]))}
+    motion |= dict.fromkeys(("length_m", "accel_rms_mps2", "jerk_rms_mps3"))
     if np.isnan(clean_m).any():
-        return found
-    found["length_m"] = bounded(float(np.linalg.norm(np.diff(clean_m, axis=0), axis=1).sum()))
+        return motion
+    motion["length_m"] = bounded(float(np.linalg.norm(np.diff(clean_m, axis=0), axis=1).sum()))
     for name, order in (("accel_rms_mps2", 2), ("jerk_rms_mps3", 3)):
         differences, steps = np.diff(clean_m, order, axis=0), steps_s[order - 1 :]
         if len(differences) and steps.min() >= LEAST_STEP_S:
             squares = (differences**2).sum(axis=1) / steps ** (2 * order)
-            found[name] = bounded(math.sqrt(float(squares.mean())))
-    return found
+            motion[name] = bounded(math.sqrt(float(squares.mean())))
+    return motion
 
 
 def action_class(action: Mapping[str, float]) -> str:
     """Return the class of an action: its greatest velocity, else its turn, else hover."""
     velocities = [action[name] for name in ("forward_mps", "left_mps", "up_mps")]
-    greatest = max(range(len(MOVES)), key=lambda k: abs(velocities[k]))
     if math.hypot(*velocities) >= HOVER_MPS:
-        return MOVES[greatest][velocities[greatest] < 0]
+        velocity, (positive, negative) = max(zip(velocities, MOVES, strict=True), key=lambda pair: abs(pair[0]))
+        return negative if velocity < 0 else positive
     turn = action["yaw_rate_degps"]
-    return "hover" if abs(turn) < TURN_DEGPS else "turn left" if turn > 0 else "turn right"
+    if abs(turn) < TURN_DEGPS:
+        return "hover"
+    return "turn left" if turn > 0 else "turn right"
 
 
 def _counts(frames: TrackRows, points: TrackRows, captioned: list[dict[str, Any]]) -> dict[str, Counter[str]]:
+    """Return `TrackCount.counts`; `captioned` are the rows with a caption."""
     rows, first = frames.rows, frames.rows[0]
     counts = {name: Counter(row[name] or "none" for row in captioned) for name in COUNTED}
-    counts["flags"] = Counter(name for row in rows for name in FLAGS if row[name])
+    flags = counts["flags"] = Counter(name for row in rows for name in FLAGS if row[name])
     for language in LANGUAGES:
-        counts["flags"][language] = sum(row[f"caption_{language}_reasoning_trace"] is not None for row in captioned)
-    counts["flags"]["legibility_known"] = sum(row["target_legible"] is not None for row in rows)
-    counts["flags"]["with_label"] = sum(row["label"] is not None for row in captioned)
-    agrees = (row["label"] is not None and row["decision"] == row["label"] for row in captioned)
-    counts["flags"]["decision_equals_label"] = sum(agrees)
+        flags[language] = sum(row[f"caption_{language}_reasoning_trace"] is not None for row in captioned)
+    flags["legibility_known"] = sum(row["target_legible"] is not None for row in rows)
+    labelled = [row for row in captioned if row["label"] is not None]
+    flags["with_label"] = len(labelled)
+    flags["decision_equals_label"] = sum(row["decision"] == row["label"] for row in labelled)
     counts["image_px"] = Counter({f"{first['width_px']} x {first['height_px']}": len(rows)})
     counts["action"] = Counter(action_class(row["action"]) for row in rows if row["action"] is not None)
     counts["values"] = Counter({name: sum(row[name] or 0 for row in captioned) for name in VALUE_COLUMNS})
     counts["step_s"] = Counter(f"{round(step, 3):g}" for step in np.diff(points.time_s).tolist())
     counts["confusion"] = Counter(f"{row['label'] or 'none'}{TAB}{row['decision'] or 'none'}" for row in captioned)
-    skies = ([row["weather"], row["time_of_day"]] for row in rows)
-    counts["sky"] = Counter(
-        TAB.join(preset_token(name) if name else "not known" for name in sky) for sky in skies if any(sky)
-    )
+    counts["sky"] = Counter()
+    for row in rows:
+        sky = (row["weather"], row["time_of_day"])
+        if any(sky):
+            counts["sky"][TAB.join(preset_token(name) if name else "not known" for name in sky)] += 1
     events = (event for row in rows for event in (row["perturbation"] or {}).items())
-    counts["events"] = Counter(f"{first['track']}{TAB}{event}{TAB}{out}" for event, out in events if out is not None)
+    counts["events"] = Counter(
+        f"{first['track']}{TAB}{event}{TAB}{outcome}" for event, outcome in events if outcome is not None
+    )
     counts["states"] = Counter()
     if first["track"] == "perturbed":
-        offsets = frames.drone_offset[~np.isnan(frames.drone_offset).any(axis=1)]
-        walked = np.nan_to_num(frames.target_offset)[~np.isnan(frames.drone_offset).any(axis=1)]
-        is_shifted = offsets[:, :3].any(axis=1) | walked.any(axis=1)
-        counts["states"] = Counter(STATES[k] for k in (is_shifted + 2 * offsets[:, 3:].any(axis=1)).tolist())
+        is_known = ~np.isnan(frames.drone_offset).any(axis=1)
+        drone, target = frames.drone_offset[is_known], np.nan_to_num(frames.target_offset)[is_known]
+        is_shifted = drone[:, :3].any(axis=1) | target.any(axis=1)
+        is_turned = drone[:, 3:].any(axis=1)
+        counts["states"] = Counter(STATES[index] for index in (is_shifted + 2 * is_turned).tolist())
     return counts
 
 
@@ -224,20 +229,23 @@ def numbers_of(tracks: Sequence[TrackCount], num_frames: int) -> Numbers:
             frames[getattr(track, name)] += track.frames
         counts[name] = _sorted(frames)
         counts[f"tracks_by_{name}"] = _sorted(Counter(getattr(track, name) for track in tracks))
-    trajectories = dict[str, TrackCount]()  # one track of each: the clean one where it is released
+    trajectories = dict[str, TrackCount]()  # one track of each: the clean one if it is released
     for track in sorted(tracks, key=lambda track: track.track != "clean"):
         trajectories.setdefault(track.trajectory, track)
-    moved = [(one.motion["accel_rms_mps2"], one.motion["jerk_rms_mps3"]) for one in trajectories.values()]
-    known = [(accel, jerk) for accel, jerk in moved if accel is not None and jerk is not None]
-    scores = [smoothness_score(*pair) for pair in known]
+    known = [
+        (track.motion["accel_rms_mps2"], track.motion["jerk_rms_mps3"])
+        for track in trajectories.values()
+        if track.motion["accel_rms_mps2"] is not None and track.motion["jerk_rms_mps3"] is not None
+    ]
+    scores = [smoothness_score(accel, jerk) for accel, jerk in known]
     within = sum(accel <= ACCEL_RMS_MAX_MPS2 and jerk <= JERK_RMS_MAX_MPS3 for accel, jerk in known)
     below = sum(score < REVIEW_BELOW for score in scores)
     counts["motion"] = {"known": len(known), "within": within, "score_below": below}
-    spreads = _sums(tracks, list(trajectories.values())) | {"smoothness": Sum.of(scores)}
+    sums = _sums(tracks, list(trajectories.values())) | {"smoothness": Sum.of(scores)}
     return Numbers(
         frames=sum(track.frames for track in tracks), flights=len(tracks), trajectories=len(trajectories),
         flights_shorter_than_num_frames=sum(track.frames < num_frames for track in tracks), counts=counts,
-        spreads={name: own.spread() for name, own in spreads.items()},
+        spreads={name: values.spread() for name, values in sums.items()},
         example=next((track.example for track in tracks if track.example), {}),
     )  # fmt: skip
 
@@ -249,8 +257,8 @@ def _sums(tracks: Sequence[TrackCount], trajectories: Sequence[TrackCount]) -> d
     return {
         "track_frames": Sum.of(track.frames for track in tracks),
         "track_duration_s": Sum.of(track.motion["duration_s"] for track in tracks),
-        **{f"trajectory_{name}": Sum.of(one.motion[name] for one in trajectories) for name in motions},
-        **{f"trajectory_{name}": Sum.of(one.sums[name].spread().mean for one in trajectories) for name in means},
+        **{f"trajectory_{name}": Sum.of(track.motion[name] for track in trajectories) for name in motions},
+        **{f"trajectory_{name}": Sum.of(track.sums[name].spread().mean for track in trajectories) for name in means},
         **{name: Sum.all(track.sums[name] for track in tracks) for name in (*POOLED, *CAPTION_FIELDS)},
     }
 

@@ -1,5 +1,5 @@
-"""Read a release: its rows, checked for what every reader relies on, and its tracks with frames and points, in order;
-and the rows of a track as arrays, which checks and exports use.
+"""Read a release: its rows, checked for what every reader relies on, its tracks in order, with frames and points, and
+the rows of a track as arrays, which checks and exports use.
 
 Memory holds a row group and the points of one shard, however large the release is.
 """
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain, groupby
+from itertools import chain, groupby, zip_longest
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cosfly.formats.captions import FIELDS
 from cosfly.formats.frames import Camera, FrameFile
-from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.people import Goal, People, read_goal
 from cosfly.formats.playback import EVENTS, Perturbation, TargetRecord, Track
-from cosfly.formats.shown_captions import ReleasedTrack, ShownCaption
-from cosfly.geometry.axes import BODY_FROM_CAMERA, CORNER_SIGNS, rotation_matrices
+from cosfly.geometry.axes import rotation_matrices
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import parse_document, validated
 from cosfly.runtime.tables import arrow_errors, open_table, row_batches, row_groups
@@ -32,7 +29,6 @@ from release.columns import (
     BOX,
     COMPANY_COLUMNS,
     INTRINSICS,
-    LANGUAGES,
     PICTURES,
     PLACE,
     POINT,
@@ -40,7 +36,6 @@ from release.columns import (
     POSE,
     REQUIRED,
     SCALAR_NAMES,
-    VALUES,
     matrices_of,
     track_name,
 )
@@ -49,7 +44,6 @@ from release.record import Shard
 Row = dict[str, Any]
 Pictures = dict[FrameFile, bytes | memoryview | None]  # of a frame
 BATCH_ROWS = 2  # whose pictures are in memory at once
-NEAR_M = 0.3  # the renderers' near plane
 MOST_FRAMES = 10_000_000  # of a track
 LEAST_ZOOMED = 3  # rows whose camera is not that of most rows
 LARGEST = 1e9  # of a value: beyond any town, track and picture
@@ -57,36 +51,34 @@ REBUILD = "download the release again, or build it again"
 
 
 def vectors(rows: Sequence[Row], name: str, members: tuple[str, ...]) -> np.ndarray:
-    """Return a column of groups, (n, members) float64, NaN where null or incomplete."""
-    groups = (row.get(name) or {} for row in rows)
-    return np.array([[group.get(m) for m in members] for group in groups], dtype=np.float64).reshape(-1, len(members))
+    """Return a column of structs of numbers, (n, members) float64, NaN where null or incomplete."""
+    structs = (row.get(name) or {} for row in rows)
+    values = [[struct.get(member) for member in members] for struct in structs]
+    return np.array(values, dtype=np.float64).reshape(-1, len(members))
 
 
 def _vectors(name: str, members: tuple[str, ...]) -> cached_property[np.ndarray]:
+    """Return the property of `TrackRows` that has a column of structs."""
     return cached_property(lambda track: vectors(track.rows, name, members))
 
 
 @dataclass(frozen=True)
 class TrackRows:
-    """The rows of one track in the order of their frames, with the columns of a release; a column that a format lacks
-    is None everywhere.
+    """The n rows of one track in the order of their frames, with the columns of a release; a column that a format lacks
+    is None everywhere."""
 
-    name: `run/town/trajectory/variant`. given_id: what its sample ids must begin with, None where nobody knows.
-    is_foreign: nothing says that cosfly drew it, so that its person may be of another size.
-    """
-
-    name: str
+    name: str  # run/town/trajectory/variant
     rows: Sequence[Row]
-    given_id: str | None = None
+    given_id: str | None = None  # what its sample ids must begin with, None if that is not known
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def where(self, i: Any, column: str = "") -> str:
-        """Name a row, and a column of it."""
+        """Return the name of a row, and of a column of it, for messages."""
         row = self.rows[int(i)]
-        place = row.get("sample_id") or f"{self.name} frame {row.get('frame_index')}"
-        return f"{place}: {column}" if column else str(place)
+        frame = row.get("sample_id") or f"{self.name} frame {row.get('frame_index')}"
+        return f"{frame}: {column}" if column else str(frame)
 
     def column(self, name: str) -> list[Any]:
         return [row.get(name) for row in self.rows]
@@ -96,25 +88,29 @@ class TrackRows:
         return np.array([np.nan if value is None else value for value in self.column(name)], dtype=np.float64)
 
     def flags(self, name: str) -> np.ndarray:
+        """Return a column of flags, (n,) bool, False where null."""
         return np.array([bool(value) for value in self.column(name)])
 
-    index = cached_property(
-        lambda self: np.array([-1 if i is None else i for i in self.column("frame_index")], np.int64)
-    )
-    time_s = cached_property(lambda self: self.numbers("time_s"))
-    visibility = cached_property(lambda self: self.numbers("visibility"))
-    pose = _vectors("pose", POSE)
-    target_m = _vectors("target", POINT)
-    drone_offset = _vectors("drone_offset", POSE)
-    target_offset = _vectors("target_offset", POINT)
-    uv = _vectors("target_uv", ("u_px", "v_px"))
-    box = _vectors("target_bbox", BOX)
-    mask_box = _vectors("target_mask_bbox", BOX)
-    intrinsics = _vectors("intrinsics", INTRINSICS)
+    # Columns as float64, NaN where null. Poses are x, y, z in metres and pitch, yaw, roll in degrees, right-handed.
+    time_s = cached_property(lambda self: self.numbers("time_s"))  # (n,)
+    visibility = cached_property(lambda self: self.numbers("visibility"))  # (n,)
+    pose = _vectors("pose", POSE)  # (n, 6)
+    target_m = _vectors("target", POINT)  # (n, 3)
+    drone_offset = _vectors("drone_offset", POSE)  # (n, 6)
+    target_offset = _vectors("target_offset", POINT)  # (n, 3)
+    uv = _vectors("target_uv", ("u_px", "v_px"))  # (n, 2)
+    box = _vectors("target_bbox", BOX)  # (n, 4) xmin, ymin, xmax, ymax, px
+    mask_box = _vectors("target_mask_bbox", BOX)  # (n, 4)
+    intrinsics = _vectors("intrinsics", INTRINSICS)  # (n, 4) fx, fy, cx, cy, px
+
+    @cached_property
+    def index(self) -> np.ndarray:
+        """(n,) int64, the indices of the frames, -1 where null."""
+        return np.array([-1 if i is None else i for i in self.column("frame_index")], np.int64)
 
     @cached_property
     def zooms(self) -> bool:
-        """Whether its camera changes; one or two rows that differ from all others are no zoom."""
+        """Whether the camera changes; one or two rows that differ from all others are no zoom."""
         _, counts = np.unique(self.intrinsics, axis=0, return_counts=True)
         return bool(len(self) - counts.max() >= LEAST_ZOOMED)
 
@@ -124,15 +120,12 @@ class TrackRows:
         return np.stack([self.numbers("width_px"), self.numbers("height_px")], axis=1)
 
     @cached_property
-    def events(self) -> list[dict[str, str] | None]:
-        groups = self.column("perturbation")
-        return [group if group and all(group.get(event) for event in EVENTS) else None for group in groups]
-
-    @cached_property
     def is_foreign(self) -> bool:
-        """Nothing in the rows is what only cosfly writes: the box of the person's pixels, or what became of a
-        perturbation."""
-        return bool(np.isnan(self.mask_box).all()) and not any(self.events)
+        """Whether the rows have nothing that only cosfly writes, a box of the person's pixels or the outcome of each
+        event of a perturbation. The person may then be of another size."""
+        outcomes = [struct or {} for struct in self.column("perturbation")]
+        has_outcomes = any(all(outcome.get(event) for event in EVENTS) for outcome in outcomes)
+        return bool(np.isnan(self.mask_box).all()) and not has_outcomes
 
     @cached_property
     def rotations(self) -> np.ndarray:
@@ -140,29 +133,16 @@ class TrackRows:
         return rotation_matrices(np.radians(self.pose[:, 3:]))
 
     @cached_property
-    def projected_corners(self) -> np.ndarray:
-        """The corners of a person of ours at each row's target, (n, 8, 2) px; NaN where one lies behind the camera."""
-        corners = self.target_m[:, None, :] + CORNER_SIGNS * np.array(PERSON_HALF_EXTENTS_M)
-        body = np.einsum("nji,nkj->nki", self.rotations, corners - self.pose[:, None, :3])
-        x, y, z = np.moveaxis(body @ BODY_FROM_CAMERA, 2, 0)
-        fx, fy, cx, cy = (values[:, None] for values in self.intrinsics.T)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            uv = np.stack([fx * x / z + cx, fy * y / z + cy], axis=2)
-        uv[~(z > NEAR_M).all(axis=1)] = np.nan
-        return uv
-
-    @cached_property
     def people(self) -> People | None:
-        """What people look like, None where nobody says. Raises InputError, as `goal` does."""
-        told, where = self.rows[0].get("people"), self.where(0, "people")
-        return None if told is None else validated(People, parse_document(told, where), where)
+        """What people look like, None if the column is null. Raises InputError, as `goal` does."""
+        text, where = self.rows[0].get("people"), self.where(0, "people")
+        return None if text is None else validated(People, parse_document(text, where), where)
 
     @cached_property
     def goal(self) -> Goal | None:
-        """Whom to follow; its frame is that of the whole track."""
-        told = {name: self.rows[0].get(f"goal_{name}") for name in ("frame", "en", "zh", "says")}
-        is_told = told["frame"] is not None
-        return read_goal(told, MOST_FRAMES, self.where(0, "goal_en")) if is_told else None
+        """Whom to follow, None if the columns are null; its frame is an index in the whole track."""
+        values = {name: self.rows[0].get(f"goal_{name}") for name in ("frame", "en", "zh", "says")}
+        return None if values["frame"] is None else read_goal(values, MOST_FRAMES, self.where(0, "goal_en"))
 
     @property
     def is_clean(self) -> bool:
@@ -170,55 +150,29 @@ class TrackRows:
 
     @cached_property
     def track(self) -> Track:
-        """The same as a track of the playback tree, for those who know that."""
+        """The rows as a track of a playback tree."""
         first = self.rows[0]
         matrices = matrices_of(self.intrinsics)
-        camera = Camera(int(self.size_px[0, 0]), int(self.size_px[0, 1]), matrices[0])
         has_mask = not np.isnan(self.mask_box).all()
+        target = TargetRecord(
+            in_view=self.flags("target_in_view"), visible=self.flags("target_visible"),
+            depth_m=self.numbers("target_depth_m"), uv=self.uv, bbox=self.box, visibility=self.visibility,
+            mask_bbox=self.mask_box if has_mask else None,
+            legible=None if None in self.column("target_legible") else self.flags("target_legible"),
+        )  # fmt: skip
+        perturbation = Perturbation(
+            self.flags("is_perturbed"), self.drone_offset[:, :3], self.drone_offset[:, 3:], self.target_offset
+        )
+        bystanders = None
+        if None not in self.column("others_in_view"):
+            bystanders = np.stack([self.numbers(name) for name in COMPANY_COLUMNS], axis=1)
         return Track(
             town=str(first.get("town")), trajectory=str(first.get("trajectory")), variant=str(first.get("variant")),
-            camera=camera, time_s=self.time_s, positions_m=self.pose[:, :3], rotations_deg=self.pose[:, 3:],
-            targets_m=self.target_m, is_original=self.is_clean,
-            target=TargetRecord(
-                in_view=self.flags("target_in_view"), visible=self.flags("target_visible"),
-                depth_m=self.numbers("target_depth_m"), uv=self.uv, bbox=self.box,
-                visibility=self.numbers("visibility"), mask_bbox=self.mask_box if has_mask else None,
-                legible=None if None in self.column("target_legible") else self.flags("target_legible"),
-            ),
-            perturbation=Perturbation(
-                self.flags("is_perturbed"), self.drone_offset[:, :3], self.drone_offset[:, 3:], self.target_offset
-            ),
-            intrinsics=matrices if self.zooms else None,
-            people=self.people, goal=self.goal, bystanders=None if None in self.column("others_in_view")
-            else np.stack([self.numbers(name) for name in COMPANY_COLUMNS], axis=1),
+            camera=Camera(int(self.size_px[0, 0]), int(self.size_px[0, 1]), matrices[0]), time_s=self.time_s,
+            positions_m=self.pose[:, :3], rotations_deg=self.pose[:, 3:], targets_m=self.target_m,
+            is_original=self.is_clean, target=target, perturbation=perturbation,
+            intrinsics=matrices if self.zooms else None, people=self.people, goal=self.goal, bystanders=bystanders,
         )  # fmt: skip
-
-    def shown(self, points: TrackRows, twin: TrackRows | None, settings: dict[str, Any]) -> ReleasedTrack:
-        """Return what a checker of captions needs. points, twin: All points of this track and of its clean one.
-        settings: Of the captions, as the record has them."""
-        captions = [shown_caption(row) for row in self.rows if row.get("has_caption")]
-        same = twin is not None and len(twin) == len(points)
-        return ReleasedTrack(points.track, captions, twin.track if twin is not None and same else None, settings)
-
-
-def shown_caption(row: Row) -> ShownCaption:
-    """Return the caption of a row. Raises KeyError and TypeError where the row has not all of one, which is found
-    elsewhere."""
-    return ShownCaption(
-        sample_id=row["sample_id"],
-        frame_index=row["frame_index"],
-        window=row["caption_window"] or [],
-        picture_px=tuple(row["caption_picture_px"]),
-        prompts={language: row[f"prompt_{language}"] for language in LANGUAGES if row.get(f"prompt_{language}")},
-        texts={language: {name: row[f"caption_{language}_{name}"] for name in FIELDS} for language in LANGUAGES},
-        writing=row["writing"],
-        values={language: tuple(row[f"{name}_{language}"] for name in VALUES) for language in LANGUAGES},
-        evidence=row["evidence"],
-        decision=row["decision"],
-        repair=row["repair_strategy"],
-        label=row["label"],
-        verdict=row["verdict"],
-    )
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -249,19 +203,21 @@ def row_lists(shard: Path, columns: Sequence[str], *, strict: bool = True) -> It
 
 
 def _check_values(group: pa.Table, shard: Path) -> None:
-    """Raise InputError if a required column has a null, or a column of numbers one that is not finite."""
+    """Raise InputError if a required value or a number of a struct is null, or a number is not finite."""
     for member in group.schema:
-        column = group.column(member.name)
-        most_nulls = 0 if member.name in REQUIRED else column.null_count
-        is_struct = pa.types.is_struct(member.type)
-        parts = [pc.struct_field(column, i) for i in range(member.type.num_fields)] if is_struct else []
-        is_plain = all(pa.types.is_floating(part.type) for part in parts)  # words may be missing
-        if any(part.null_count > most_nulls for part in (column, *(parts if is_plain else ()))):
-            where, expected = f"{shard}: {member.name}", "a value in every row"
+        where, column = f"{shard}: {member.name}", group.column(member.name)
+        parts = [column]
+        if pa.types.is_struct(member.type):
+            parts = [pc.struct_field(column, i) for i in range(member.type.num_fields)]
+        # A struct of numbers is null as a whole or not at all; of one of words some may be null.
+        is_of_numbers = all(pa.types.is_floating(part.type) for part in parts)
+        is_incomplete = is_of_numbers and any(part.null_count > column.null_count for part in parts)
+        if is_incomplete or (member.name in REQUIRED and column.null_count):
+            expected = "a value in every row"
             raise InputError("a required value is missing in a row", where=where, got="null", expected=expected)
-        for part in parts or [column]:
+        for part in parts:
             if pa.types.is_floating(part.type) and pc.all(pc.is_finite(part)).as_py() is False:
-                raise InputError("a number is not finite", where=f"{shard}: {member.name}")
+                raise InputError("a number is not finite", where=where)
 
 
 def read_tracks(
@@ -275,27 +231,30 @@ def read_tracks(
         InputError: Frames and points are not of the same tracks in the same order.
     """
     names = [*PLACE, *(name for name in columns if name not in PLACE)]
-    both = [
-        groupby(chain.from_iterable(row_lists(folder / file.path, wanted, strict=strict)), itemgetter(*PLACE))
-        for file, wanted in ((shard, names), (shard.points, POINT_NAMES))
-    ]
-    points = both[1]
-    for place, frames in both[0]:
-        own, of_points = next(points, (None, ()))
-        if own != place:
-            got = "no further points" if own is None else f"points of {track_name(own)}"
-            what, expected = "the points file has other tracks than the frames file", f"points of {track_name(place)}"
+    tracks_of_frames = _rows_by_track(folder / shard.path, names, strict)
+    tracks_of_points = _rows_by_track(folder / shard.points.path, POINT_NAMES, strict)
+    for pair in zip_longest(tracks_of_frames, tracks_of_points, fillvalue=(None, iter(()))):
+        (place, frames), (place_of_points, points) = pair
+        if place is None or place != place_of_points:
+            what = "the points file has other tracks than the frames file"
+            got, expected = [
+                "no further points" if other is None else f"points of {track_name(other)}"
+                for other in (place_of_points, place)
+            ]
             raise InputError(what, where=folder / shard.points.path, got=got, expected=expected, fix=REBUILD)
         name = track_name(place)
-        yield TrackRows(name, list(frames)), TrackRows(name, list(of_points))
-    if (more := next(points, None)) is not None:
-        what, got = "the points file has other tracks than the frames file", f"points of {track_name(more[0])}"
-        raise InputError(what, where=folder / shard.points.path, got=got, expected="no further points", fix=REBUILD)
+        yield TrackRows(name, list(frames)), TrackRows(name, list(points))
+
+
+def _rows_by_track(path: Path, columns: Sequence[str], strict: bool) -> Iterator[tuple[Any, Iterator[Row]]]:
+    """Yield the place and the rows of each track of a file; the rows are read before the next track."""
+    return groupby(chain.from_iterable(row_lists(path, columns, strict=strict)), itemgetter(*PLACE))
 
 
 def read_pictures(folder: Path, shard: Shard, files: Sequence[FrameFile]) -> Iterator[Pictures]:
     """Yield the pictures of the rows of a shard, in order."""
-    names, path = {file: PICTURES[file].name for file in files}, folder / shard.path
+    names = {file: PICTURES[file].name for file in files}
+    path = folder / shard.path
     with open_table(path, tree=folder) as table:
         for group in range(table.num_row_groups):
             for batch in row_batches(path, table, group, list(names.values()), BATCH_ROWS):

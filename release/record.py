@@ -1,4 +1,8 @@
-"""`release.json`: the record of a release. Written by build, checked by verify, rendered by card."""
+"""`release.json`: the record of a release. Written by build, checked by verify, rendered by card.
+
+In its fields a flight is a track, `run/town/trajectory/variant`, a walk a pedestrian trajectory, and a pair the clean
+and the perturbed track of a drone trajectory.
+"""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,7 +22,10 @@ from release.columns import SPLIT_NAMES, SplitName
 RELEASE_FORMAT = FileFormat("cosfly.release", "7.0", "release record")
 RECORD = "release.json"
 
-Counts = dict[str, int]
+DIGEST_CHARACTERS = 12  # of the content's digest, in the names of shards
+FRAMES_FOLDER, POINTS_FOLDER = "data", "points"  # of the shards
+
+Counts = dict[str, int]  # value -> how often it occurs
 SplitBy = Literal["walk", "town"]
 Pairs = Literal["both", "any"]
 Selection = Literal["stride", "windows", "all"]
@@ -38,31 +45,29 @@ class StoredFile(Strict):
 
 
 class Shard(StoredFile):
-    """The released frames of some tracks of one split; `points` has all points of these tracks, in the same order."""
+    """The released frames of some tracks of one split."""
 
     split: SplitName
-    points: StoredFile
+    points: StoredFile  # all points of these tracks, in the same order
 
 
 class ReleasedFlight(Strict):
-    """One track, `run/town/trajectory/variant`; `frames_available` is the number of its points.
+    """One track."""
 
-    pair: the other track of the same trajectory, null where that is not released. five_ray_mean: share of five
-    rays that reach the person, as the inspection measured it on the map, which the shards do not hold; null where
-    nobody did.
-    """
-
-    flight: str
-    frames: int
-    frames_available: int
+    flight: str  # run/town/trajectory/variant
+    frames: int  # released ones
+    frames_available: int  # number of its points
     split: SplitName
     walk: str
-    pair: str | None
+    pair: str | None  # the other track of the same trajectory, null if that is not released
+    # Share of five rays that reach the person, as the inspection measured it on the map; null without an inspection.
     five_ray_mean: float | None = None
 
     @property
     def town(self) -> str:
-        return f"{self.flight}//".split("/")[1]
+        """The town of the track, "" if the record has a flight without one."""
+        _, _, in_run = self.flight.partition("/")
+        return in_run.partition("/")[0]
 
     @property
     def trajectory(self) -> str:
@@ -77,12 +82,11 @@ class ReleasedMap(TownMap):
 
 
 class Settings(Strict):
-    """The settings that change what is released. num_frames: Largest number of each track, except of the selection
-    `all`. window_frames: Of a caption's window."""
+    """The settings that change what is released."""
 
     selection: Selection
-    num_frames: int = Field(ge=1)
-    window_frames: int = Field(ge=1)
+    num_frames: int = Field(ge=1)  # the most of each track; not used with selection `all`
+    window_frames: int = Field(ge=1)  # of a caption's window
     tracks: list[str]
     pairs: Pairs
     modalities: list[FrameFile] = Field(min_length=1)
@@ -98,28 +102,28 @@ class StoredDepth(Strict):
 
 
 class SplitNumbers(Strict):
-    """One split; walks and towns by name."""
+    """One split."""
 
     frames: int
     captions: int
     flights: int
     trajectories: int
-    walks: list[str]
+    walks: list[str]  # names
     towns: list[str]
 
 
 class Splits(Strict):
-    """What two splits may not share, the rule, and the splits; those without rows are skipped."""
+    """How the splits were assigned, and what they contain."""
 
-    by: SplitBy
-    rule: str
+    by: SplitBy  # what two splits may not share
+    rule: str  # in words
     seed: int
     fractions: dict[SplitName, float]
-    splits: dict[SplitName, SplitNumbers]
+    splits: dict[SplitName, SplitNumbers]  # without those that have no rows
 
 
-class MadeBy(Strict):
-    """One stage of one source: its settings, seed and version. Paths and addresses are skipped."""
+class SourceStage(Strict):
+    """One stage that made a source: its settings, without paths and addresses, seed and version."""
 
     stage: str
     code_version: str
@@ -128,24 +132,23 @@ class MadeBy(Strict):
 
 
 class SourceRecord(Strict):
-    """One source of the release: fingerprints of its tree, captions, inspection and what people decided of that (null:
-    without), and the stages that made them."""
+    """One source of the release: fingerprints of its files, null if there is none, and the stages that made them."""
 
     run: str
-    data_sha256: str
+    data_sha256: str  # of the playback tree
     captions_sha256: str
-    inspect_sha256: str | None = None
-    review_sha256: str | None = None
-    stages: list[MadeBy]
+    inspect_sha256: str | None = None  # of the inspection
+    review_sha256: str | None = None  # of what people decided about the tracks to review
+    stages: list[SourceStage]
 
 
 class ReleasedTeacher(Strict):
-    """Who was asked, and how: of all captions that were read, the released ones and the others."""
+    """A teacher of the captions that were read, of which not all are released."""
 
     kind: str
     model: str
     settings: dict[str, Any]
-    captions: int
+    captions: int  # number of its captions
 
 
 class Provenance(Strict):
@@ -159,29 +162,25 @@ class Provenance(Strict):
 
 
 class Spread(Strict):
-    """Mean, standard deviation (of the population), least, greatest and number of values."""
+    """The distribution of some values."""
 
     count: int = 0
     mean: float | None = None
-    std: float | None = None
+    std: float | None = None  # standard deviation of the population
     min: float | None = None
     max: float | None = None
 
 
 class Numbers(Strict):
-    """Every number of the card and the statistics; all are computed from the shards (release/counting.py).
-
-    counts: Frames by a value of what the key names. spreads: Of frames, tracks and trajectories. example: The first
-    caption's sample_id and texts, empty without captions.
-    """
+    """Every number of the card and the statistics; all are computed from the shards (release/counting.py)."""
 
     frames: int
     flights: int
     trajectories: int
     flights_shorter_than_num_frames: int
-    counts: dict[str, Counts]
-    spreads: dict[str, Spread]
-    example: dict[str, str | None]
+    counts: dict[str, Counts]  # what is counted -> frames by its value, as {"decision": {"hover": 12}}
+    spreads: dict[str, Spread]  # of frames, tracks and trajectories, as {"distance_m": {"mean": 14.2}}
+    example: dict[str, str | None]  # the first caption's sample_id and texts, empty without captions
 
     def of(self, name: str) -> Counter[str]:
         """Return the counts of a name."""
@@ -189,35 +188,29 @@ class Numbers(Strict):
 
 
 class FlightHistory(Strict):
-    """found = released + left_out, by reason; those of trees without an inspection were not inspected."""
+    """Tracks: found = released + left_out."""
 
     found: int
-    inspected: int
+    inspected: int  # those of trees with an inspection
     released: int
-    left_out: Counts
+    left_out: Counts  # by reason
 
 
 class CaptionHistory(Strict):
-    """read = dropped, by reason, + released + frame_not_selected + flight_left_out.
-
-    frames_without: The released frames without a caption, by reason.
-    """
+    """Captions: read = dropped + released + frame_not_selected + flight_left_out."""
 
     read: int
-    dropped: Counts
+    dropped: Counts  # by reason
     released: int
     frame_not_selected: int
     flight_left_out: int
-    frames_without: Counts
+    frames_without: Counts  # released frames without a caption, by reason
 
 
 class History(Strict):
-    """What the shards do not show: what became of all tracks and captions.
+    """What became of all tracks and captions, which the shards do not show."""
 
-    trajectories: of the sources that were inspected; null where none was.
-    """
-
-    trajectories: TrajectoryFunnel | None
+    trajectories: TrajectoryFunnel | None  # of the sources with an inspection, null if none has one
     flights: FlightHistory
     captions: CaptionHistory
 
@@ -227,19 +220,19 @@ class ReleaseRecord(Strict):
 
     name: str
     licence: str
-    credits: str
+    credits: str  # attribution, besides that of the maps
     maps: list[ReleasedMap]
-    made_by: str
+    made_by: str  # name and version of the program
     settings: Settings
-    frame_selection: str
+    frame_selection: str  # the rule, in words
     depth: StoredDepth | None  # null: without depth
-    coordinates: dict[str, Any]
+    coordinates: dict[str, Any]  # axes, units and meanings
     splits: Splits
     numbers: Numbers
     history: History
     provenance: Provenance
     flights: list[ReleasedFlight]
-    content_digest: str
+    content_digest: str  # `digest_of` the shards
     shards: list[Shard]
 
     @property
@@ -249,7 +242,8 @@ class ReleaseRecord(Strict):
 
     def require_whole_tracks(self, what: str, where: Path) -> None:
         """Raise InputError if consecutive frames are needed and a uniform stride has skipped some."""
-        if self.settings.selection == "stride" and any(one.frames < one.frames_available for one in self.flights):
+        is_cut = any(track.frames < track.frames_available for track in self.flights)
+        if self.settings.selection == "stride" and is_cut:
             raise InputError(
                 f"{what} needs consecutive frames, which this release does not have", where=where,
                 got=f"{self.settings.num_frames} frames of each track, chosen with a stride",
@@ -260,56 +254,51 @@ class ReleaseRecord(Strict):
 def numbers_of_splits(
     tracks: Sequence[ReleasedFlight], captions: Mapping[SplitName, int]
 ) -> dict[SplitName, SplitNumbers]:
-    """Return the numbers of each split that has tracks. captions: of each split."""
-    found = {}
+    """Return the numbers of each split that has tracks, given the number of captions of each split."""
+    numbers = {}
     for split in SPLIT_NAMES:
-        if own := [track for track in tracks if track.split == split]:
-            found[split] = SplitNumbers(
-                frames=sum(track.frames for track in own),
-                captions=captions.get(split, 0),
-                flights=len(own),
-                trajectories=len({track.trajectory for track in own}),
-                walks=sorted({track.walk for track in own}),
-                towns=sorted({track.town for track in own}),
-            )
-    return found
+        if in_split := [track for track in tracks if track.split == split]:
+            numbers[split] = SplitNumbers(
+                frames=sum(track.frames for track in in_split), captions=captions.get(split, 0), flights=len(in_split),
+                trajectories=len({track.trajectory for track in in_split}),
+                walks=sorted({track.walk for track in in_split}), towns=sorted({track.town for track in in_split}),
+            )  # fmt: skip
+    return numbers
 
 
-DIGEST_CHARACTERS = 12  # of the content's digest, in the names of shards
+# --- files of a release -----------------------------------------------------------------------------------------------
 
 
 def digest_of(shards: Iterable[Shard]) -> str:
     """Return the sha256 of a release's content: of split and sha256 (frames, points) of each shard in order."""
-    return sha256_bytes("".join(f"{one.split} {one.sha256} {one.points.sha256}\n" for one in shards).encode())
-
-
-FRAMES_FOLDER, POINTS_FOLDER = "data", "points"
+    lines = [f"{shard.split} {shard.sha256} {shard.points.sha256}\n" for shard in shards]
+    return sha256_bytes("".join(lines).encode())
 
 
 def shard_paths(splits: Sequence[SplitName], digest: str) -> list[tuple[str, str]]:
-    """Return the paths of frames and points of each shard, given its split: it has its number in its split."""
-    counts, numbers, paths = Counter(splits), Counter[str](), list[tuple[str, str]]()
+    """Return the paths of frames and points of each shard, given the split of each. Shards of a split are numbered:
+    `data/train-0123456789ab-00001-of-00003.parquet`."""
+    counts = Counter(splits)
+    next_number = Counter[str]()
+    paths: list[tuple[str, str]] = []
     for split in splits:
-        name = f"{split}-{digest[:DIGEST_CHARACTERS]}-{numbers[split]:05d}-of-{counts[split]:05d}.parquet"
+        name = f"{split}-{digest[:DIGEST_CHARACTERS]}-{next_number[split]:05d}-of-{counts[split]:05d}.parquet"
         paths.append((f"{FRAMES_FOLDER}/{name}", f"{POINTS_FOLDER}/{name}"))
-        numbers[split] += 1
+        next_number[split] += 1
     return paths
 
 
 def shard_pattern(split: SplitName, digest: str, folder: str = FRAMES_FOLDER) -> str:
-    """Return the pattern that the card names for a split. The library's cache goes by it: without the digest a new
-    release shows old rows."""
+    """Return the pattern of a split's files, which the card names. `datasets` uses it as the key of its cache: without
+    the digest a new release would show old rows."""
     return f"{folder}/{split}-{digest[:DIGEST_CHARACTERS]}-*.parquet"
 
 
 def release_folder(folder: Path) -> Path:
-    """Return the folder that holds the files of a release: this one, or where `release build` and `cosfly run` put them
-    below it.
-
-    A folder that holds none is given as it is, for its reader to say so.
-    """
-    places = (folder, folder / "dataset", folder / "release/dataset")
-    return next((place for place in places if (place / RECORD).is_file()), folder)
+    """Return the folder that holds the files of a release: this one, or the one below it where `release build` or
+    `cosfly run` puts them; if there is none, this one, so that its reader reports the error."""
+    candidates = (folder, folder / "dataset", folder / "release/dataset")
+    return next((candidate for candidate in candidates if (candidate / RECORD).is_file()), folder)
 
 
 def write_record(path: Path, record: ReleaseRecord) -> None:
@@ -320,7 +309,7 @@ def read_record(path: Path) -> ReleaseRecord:
     """Read `release.json`.
 
     Raises:
-        InputError: there is none; or names the file and the field.
+        InputError: there is none, or a field is wrong, which the error names.
     """
     if not path.exists():
         raise InputError(

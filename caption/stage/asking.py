@@ -247,12 +247,9 @@ class Asking:
         """Count a window that was refused or got no answer; many in a row are a fault of the server."""
         self.num_failed_in_row += 1
         if self.num_failed_in_row >= STOP_AFTER_FAILURES:
-            raise TeacherError(
-                f"{self.num_failed_in_row} windows in a row got no answer or were refused",
-                where=self.cfg.teacher,
-                got=got,
-                fix="fix the server, then run the same command again; answered windows are not asked again",
-            )
+            what = f"{self.num_failed_in_row} windows in a row got no answer or were refused"
+            fix = "fix the server, then run the same command again; answered windows are not asked again"
+            raise TeacherError(what, where=self.cfg.teacher, got=got, fix=fix)
 
     def _stop_if_hopeless(self, caption: Caption) -> None:
         """End the run if none of the first answers is accepted: the rest would be no better."""
@@ -263,13 +260,10 @@ class Asking:
             return
         self.dropped[str(caption.drop_reason)] += 1
         if self.dropped.total() == limit:
-            raise TeacherError(
-                f"none of the first {limit} answers was accepted",
-                where=self.cfg.teacher,
-                got=explain_drops(self.dropped),
-                fix=f"to see why, read {self.stage.path / ANSWERS}/*.jsonl or run `cosfly caption doctor`; to continue "
-                "anyway, pass --set caption.stop_after_dropped=0",
-            )
+            what = f"none of the first {limit} answers was accepted"
+            see = f"to see why, read {self.stage.path / ANSWERS}/*.jsonl or run `cosfly caption doctor`"
+            fix = f"{see}; to continue anyway, pass --set caption.stop_after_dropped=0"
+            raise TeacherError(what, where=self.cfg.teacher, got=explain_drops(self.dropped), fix=fix)
 
 
 def read_quarantine(stage_path: Path) -> dict[str, Failed]:

@@ -33,30 +33,25 @@ COLUMNS = ("strategy", "repaired", "consistency", "naturalness", "requests each"
 
 @dataclass(frozen=True)
 class Trial:
-    """One conflict and its regeneration by a strategy, without the mirror. last: None if it failed."""
+    """One conflict and its regeneration by a strategy, without the mirror."""
 
     first: Coc
-    last: Coc | None
-    verdict: Verdict | None
-    asks: int
+    last: Coc | None  # None if the regeneration failed
+    verdict: Verdict | None  # on the last answer
+    asks: int  # of the regeneration, as its tokens
     tokens: int
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The results of one strategy on all conflicts.
-
-    Args:
-        repaired: Conflicts with a new answer that is not rejected.
-        consistency: Share of the conflicts whose new decision is the label.
-        naturalness: Mean share of words that a new text has in common with the free one; None if nothing was repaired.
-            A model's free text is natural, and a constraint changes it.
-    """
+    """The results of one strategy on all conflicts."""
 
     strategy: Strategy
     num_conflicts: int
-    repaired: int
-    consistency: float
+    repaired: int  # conflicts with a new answer that is not rejected
+    consistency: float  # share of the conflicts whose new decision is the label
+    # Mean share of words that a new text has in common with the free one, which is natural while a constraint changes
+    # it; None if nothing was repaired.
     naturalness: float | None
     asks_per_conflict: float
     tokens_per_conflict: float
@@ -69,10 +64,13 @@ class Comparison:
         return (self.strategy, str(self.repaired), f"{100 * self.consistency:.1f} %", natural, *per_conflict)
 
 
-def words_in_common(one: Coc, two: Coc) -> float:
+def words_in_common(first: Coc, second: Coc) -> float:
     """Return the share of words that two texts have in common, in order: 1 for equal texts."""
-    a, b = (f"{coc.critical_components} {coc.reasoning_trace}".split() for coc in (one, two))
-    return SequenceMatcher(None, a, b, autojunk=False).ratio()
+
+    def words(coc: Coc) -> list[str]:
+        return f"{coc.critical_components} {coc.reasoning_trace}".split()
+
+    return SequenceMatcher(None, words(first), words(second), autojunk=False).ratio()
 
 
 def compare(strategy: Strategy, trials: Sequence[Trial]) -> Comparison:
@@ -80,14 +78,12 @@ def compare(strategy: Strategy, trials: Sequence[Trial]) -> Comparison:
     repaired = [(trial.first, trial.last) for trial in trials if trial.last is not None]
     consistent = sum(trial.last is not None and trial.verdict == "CONSISTENT" for trial in trials)
     return Comparison(
-        strategy=strategy,
-        num_conflicts=len(trials),
-        repaired=len(repaired),
+        strategy=strategy, num_conflicts=len(trials), repaired=len(repaired),
         consistency=round(consistent / len(trials), 3),
         naturalness=round(fmean(itertools.starmap(words_in_common, repaired)), 3) if repaired else None,
         asks_per_conflict=round(fmean(trial.asks for trial in trials), 3),
         tokens_per_conflict=round(fmean(trial.tokens for trial in trials), 1),
-    )
+    )  # fmt: skip
 
 
 def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: int = 50) -> list[Comparison]:
@@ -122,15 +118,15 @@ async def _try_all(
     """Return the number of windows asked about, and for each of at most `most` conflicts a trial of each strategy."""
     trials: list[list[Trial]] = []
     num_windows = 0
-    every = itertools.chain.from_iterable(track.windows(cfg) for track in find_inputs(cfg, data)[0])
-    windows = (window for window in every if window.problem is None)
+    tracks, _ = find_inputs(cfg, data)
+    windows = (window for track in tracks for window in track.windows(cfg) if window.problem is None)
     with AnswerBook(out / ANSWERS) as book:  # the first answer is asked for once for all strategies
         budget = Budget(cfg.budget, cfg.most_in_flight, book.totals)
         async with open_teacher(cfg, book, seed, budget) as teacher:
             while len(trials) < most and (batch := list(itertools.islice(windows, cfg.most_in_flight))):
                 num_windows += len(batch)
-                found = await asyncio.gather(*(_try_each(window, teacher, cfg, vocabulary) for window in batch))
-                trials += filter(None, found)
+                tried = await asyncio.gather(*(_try_each(window, teacher, cfg, vocabulary) for window in batch))
+                trials += [of_window for of_window in tried if of_window]
     return num_windows, trials[:most]
 
 
@@ -154,12 +150,13 @@ async def try_strategy(
     reason = await loop.ask_freely(loop.answered)
     if reason is not None or repair.treatment_of(loop.caption.verdict) == "keep" or loop.label is None:
         return None
-    first, num_asks, tokens = loop.english.coc, loop.caption.attempts, loop.caption.usage.total
+    caption, first = loop.caption, loop.english.coc
+    asks_before, tokens_before = caption.attempts, caption.usage.total
     try:
         reason = await loop.regenerate(loop.answered)
     except NoAnswer as error:  # a teacher without a reason for the label has not repaired the conflict
         if not error.is_final:
             raise
         reason = error.cause
-    last, caption = loop.english.coc if reason is None else None, loop.caption
-    return Trial(first, last, caption.verdict, caption.attempts - num_asks, caption.usage.total - tokens)
+    last = loop.english.coc if reason is None else None
+    return Trial(first, last, caption.verdict, caption.attempts - asks_before, caption.usage.total - tokens_before)

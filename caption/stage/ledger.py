@@ -57,23 +57,18 @@ Counts = Annotated[Counter[str], PlainSerializer(most_common)]
 
 
 class RepairCounts(BaseModel, extra="forbid"):
-    """Counts of rejected answers. outcomes_by_strategy: By the attempt that repaired one, else the outcome."""
+    """Counts of rejected answers."""
 
     rejected: int = 0
-    outcomes_by_strategy: dict[str, Counts] = {}
-    asks: Counts = Counter()
+    outcomes_by_strategy: dict[str, Counts] = {}  # strategy -> the rung that repaired an answer, or the outcome
+    asks: Counts = Counter()  # by their number for one answer
 
 
 class CaptionReport(BaseModel, extra="forbid"):
-    """`caption_report.json`: counts of captions, which are added one by one. Counts by a word are in falling order.
-
-    flights: Tracks. values: Language -> values_filled, values_matched, values_contradicted. writing: Of accepted
-    captions. refusals: Of dropped windows, code -> last message of a server. judge_tokens: Of all runs into the
-    directory; None if no judge was asked.
-    """
+    """`caption_report.json`: counts of captions, which are added one by one. Counts by a word are in falling order."""
 
     teacher: TeacherRecord | None = None
-    flights: Tally = Tally()
+    flights: Tally = Tally()  # of tracks
     windows: Tally = Tally()
     asks: int = 0
     tokens: Counts = Counter()
@@ -86,12 +81,12 @@ class CaptionReport(BaseModel, extra="forbid"):
     judgements: Counts = Counter()
     structure: Counts = Counter()
     bilingual: Counts = Counter()
-    writing: Counts = Counter()
-    values: dict[str, Counts] = {}
+    writing: Counts = Counter()  # of accepted captions
+    values: dict[str, Counts] = {}  # language -> values_filled, values_matched, values_contradicted
     contradicted_captions: int = 0
     recovered: Counts = Counter()
-    refusals: dict[str, str] = {}
-    judge_tokens: Usage | None = None
+    refusals: dict[str, str] = {}  # of dropped windows: code -> last message of a server
+    judge_tokens: Usage | None = None  # of all runs into the directory; None if no judge was asked
 
     def warnings(self) -> list[str]:
         """Return what a reader must know before using the captions."""
@@ -156,10 +151,12 @@ class SampleCards:
     """Samples captions of every kind for the page: those of the smallest hash, in whatever order they come."""
 
     def __init__(self) -> None:
-        self._kinds: dict[str, list[Caption]] = {}
+        self._kinds: dict[str, list[Caption]] = {}  # dropped, repaired, or the verdict -> captions
 
     def add(self, caption: Caption) -> None:
-        kind = "dropped" if caption.status == "dropped" else "repaired" if caption.repair else str(caption.verdict)
+        kind = "repaired" if caption.repair else str(caption.verdict)
+        if caption.status == "dropped":
+            kind = "dropped"
         cards = self._kinds.setdefault(kind, [])
         cards.append(caption)
         cards.sort(key=lambda card: sha256_bytes(card.sample_id.encode()))
@@ -174,7 +171,7 @@ class SampleCards:
 
 # --- the page ---------------------------------------------------------------------------------------------------------
 
-PICTURE_WIDTH_PX = 240
+PICTURE_WIDTH_PX, CARD_FRAMES = 240, 5  # of the pictures of a sample
 VERDICTS = {  # with their meanings
     "CONSISTENT": "the decision is the label",
     "SOFT_CONFLICT": "another decision, which the trajectory does not contradict",
@@ -188,11 +185,7 @@ STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
 def page_html(
     report: CaptionReport, cards: Sequence[Caption], folders: Mapping[str, Path], budget: BudgetConfig, name: str
 ) -> str:
-    """Return the text of the page of a run with this name.
-
-    Args:
-        cards: Captions to show. folders: Track id -> its folder, for the pictures.
-    """
+    """Return the page of a run with this name. cards: Captions to show. folders: Of the tracks by id, for pictures."""
     return page(
         "caption/stage/report.html", title=name, style=STYLE, report=report, meanings=VERDICTS,
         values=tuple(ValueCounts.model_fields), language_names=LANGUAGE_NAMES, most_common=most_common,
@@ -201,28 +194,29 @@ def page_html(
 
 
 def _cost(report: CaptionReport, budget: BudgetConfig) -> list[tuple[str, str]]:
-    prompt, answer = (report.tokens.get(name, 0) for name in ("prompt_tokens", "completion_tokens"))
-    accepted, judge = report.windows.kept, report.judge_tokens
+    """Return the rows of the table of tokens and cost, those of the judge included."""
+    prompt, answer = report.tokens["prompt_tokens"], report.tokens["completion_tokens"]
+    num_accepted, judge = report.windows.kept, report.judge_tokens
     rows = [("prompt tokens", f"{prompt:,}"), ("answer tokens", f"{answer:,}")]
     if judge is not None:
         rows.append(("the judge's tokens", f"{judge.prompt_tokens:,} in, {judge.completion_tokens:,} out"))
         prompt += judge.prompt_tokens
         answer += judge.completion_tokens
-    if accepted:
-        rows.append(("tokens per accepted caption", f"{(prompt + answer) / accepted:,.0f}"))
+    if num_accepted:
+        rows.append(("tokens per accepted caption", f"{(prompt + answer) / num_accepted:,.0f}"))
     if not (budget.price_prompt or budget.price_completion):
         return [*rows, ("cost", "no prices set")]
     cost = budget.cost(prompt, answer)
     rows.append(("cost", f"{cost:,.2f}"))
-    if accepted:
-        rows.append(("cost per 1,000 accepted", f"{1000 * cost / accepted:,.2f}"))
+    if num_accepted:
+        rows.append(("cost per 1,000 accepted", f"{1000 * cost / num_accepted:,.2f}"))
     return rows
 
 
 def _card(caption: Caption, folders: Mapping[str, Path]) -> dict[str, Any]:
-    folder = folders.get(flight_of(caption.sample_id))
-    pictures = [
-        (index, None if folder is None else thumbnail(folder / frame_name(index), PICTURE_WIDTH_PX, jpeg_quality=75))
-        for index in caption.window[-5:]
-    ]
-    return {"caption": caption, "pictures": pictures}
+    """Return a caption with the indices and thumbnails of its last frames, None in place of a missing thumbnail."""
+    pictures: dict[int, str | None] = dict.fromkeys(caption.window[-CARD_FRAMES:])
+    if folder := folders.get(flight_of(caption.sample_id)):
+        for index in pictures:
+            pictures[index] = thumbnail(folder / frame_name(index), PICTURE_WIDTH_PX, jpeg_quality=75)
+    return {"caption": caption, "pictures": list(pictures.items())}

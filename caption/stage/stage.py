@@ -39,15 +39,9 @@ PACKAGE_FILES = {"glossary": GLOSSARY_FILE}  # a directory never mixes captions 
 
 
 def run(
-    cfg: CaptionConfig,
-    data: Path,
-    out: Path,
-    *,
-    seed: int = 0,
-    workers: int = 0,
-    watch: Watch = Watch(),
-    retry_failed: bool = False,
-) -> Path:
+    cfg: CaptionConfig, data: Path, out: Path, *,
+    seed: int = 0, workers: int = 0, watch: Watch = Watch(), retry_failed: bool = False,
+) -> Path:  # fmt: skip
     """Write captions of the tracks of a playback tree; return the path of `captions.jsonl`.
 
     Args:
@@ -65,19 +59,21 @@ def run(
         raise ConfigError(what, where="--retry-failed", got=f"the teacher `{cfg.teacher_kind}`", fix=fix)
     vocabulary = vocabulary_of(cfg)
     cfg = student_settings(cfg, vocabulary)
-    unused = set[str]() if cfg.caption_file is None else {sample_id for sample_id, _ in read_given(cfg)[0]}
+    unused = set[str]()  # sample ids of a file of captions that no window has used
+    if cfg.caption_file is not None:
+        answers, _ = read_given(cfg)
+        unused = {sample_id for sample_id, _ in answers}
     stage = open_stage(cfg, data, out, seed)
-    if stage.is_complete and not _has_more(stage, cfg, retry_failed):
+    if stage.is_complete and not _continues(stage, cfg, retry_failed):
         _remove_parts(stage)  # the process may have been killed before it removed them
         return out / PRODUCT
     tracks, is_cut = find_inputs(cfg, data)
     if stage.is_complete:
         stage.reopen()
     if cfg.teacher_kind in EMBEDDED and cfg.judge.url is None:
-        items = [Item(track.item_id, track) for track in tracks]
-        args = (cfg, vocabulary, stage.path, seed)
         finished = run_items(
-            stage, items, make_worker, args, workers=workers, watch=watch, label="caption",
+            stage, [Item(track.item_id, track) for track in tracks], make_worker, (cfg, vocabulary, stage.path, seed),
+            workers=workers, watch=watch, label="caption",
             has_product=lambda item: item.payload.part(stage.path).exists(),
         )  # fmt: skip
         outcome = AskingOutcome(finished.tally)
@@ -102,11 +98,8 @@ def run(
 def _write_report(
     stage: StageFolder, cfg: CaptionConfig, tracks: list[TrackInput], outcome: AskingOutcome, unused: set[str]
 ) -> CaptionReport:
-    """Join the parts so far to `captions.jsonl`, one at a time, and write the report and its page.
-
-    Args:
-        unused: Windows of a file of captions; those that are captioned are removed.
-    """
+    """Join the parts so far to `captions.jsonl`, one at a time, and write the report and its page; remove from `unused`
+    the windows that have a caption."""
     report, cards = CaptionReport(), SampleCards()
 
     def lines() -> Iterator[bytes]:
@@ -132,19 +125,13 @@ def _finish(
     """Finish the stage if every window has an outcome; TeacherError if one should have got an answer."""
     out = stage.path
     if outcome.stopped:
-        raise TeacherError(
-            "captioning stopped, because the budget is spent",
-            where=cfg.teacher,
-            got=f"{outcome.stopped}; {tally.kept} windows accepted so far",
-            fix="raise --max-cost or --max-tokens and run the same command again; answered windows are not asked again",
-        )
+        got = f"{outcome.stopped}; {tally.kept} windows accepted so far"
+        fix = "raise --max-cost or --max-tokens and run the same command again; answered windows are not asked again"
+        raise TeacherError("captioning stopped, because the budget is spent", where=cfg.teacher, got=got, fix=fix)
     if outcome.unanswered:
-        raise TeacherError(
-            f"{len(outcome.unanswered)} of {tally.input} windows got no answer",
-            where=cfg.teacher,
-            got=outcome.causes,
-            fix="run the same command again; answered windows are not asked again",
-        )
+        what = f"{len(outcome.unanswered)} of {tally.input} windows got no answer"
+        fix = "run the same command again; answered windows are not asked again"
+        raise TeacherError(what, where=cfg.teacher, got=outcome.causes, fix=fix)
     if tally.input == 0:
         num_frames = cfg.window.num_frames + cfg.window.future_frames
         raise stage.nothing_kept(outcome.tracks, expected=f"a track of at least {num_frames} frames")
@@ -173,15 +160,15 @@ def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int) -> StageFol
     return StageFolder.open(out, "caption", config=cfg, inputs=inputs, seed=seed, package_files=files, retries=False)
 
 
-def _has_more(stage: StageFolder, cfg: CaptionConfig, retry_failed: bool) -> bool:
+def _continues(stage: StageFolder, cfg: CaptionConfig, retry_failed: bool) -> bool:
     """Return whether a complete directory is continued: its limit was smaller, or refused windows are asked again."""
-    manifest, wanted = read_manifest(stage.path), cfg.limit or math.inf
-    limit = manifest.facts.get("limit")
-    if limit is not None and wanted > limit:
+    manifest = read_manifest(stage.path)
+    limit, limit_before = cfg.limit or math.inf, manifest.facts.get("limit")
+    if limit_before is not None and limit > limit_before:
         return True
     if not (retry_failed and read_quarantine(stage.path)):
         return False
-    if wanted < manifest.counts.input:
+    if limit < manifest.counts.input:
         raise ResumeError(
             "the directory already contains more windows than caption.limit allows", where=stage.path,
             got=f"{manifest.counts.input} windows", expected=f"at most {cfg.limit} windows",

@@ -6,6 +6,7 @@ again.
 
 import asyncio
 import logging
+from collections import Counter
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -48,11 +49,12 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
         what, fix = "the directory is complete, so no window is left to try", "choose another --out"
         raise InputError(what, where=out, fix=fix)
     tracks, _ = find_inputs(cfg, data)
-    left = [track for track in tracks if track.guess_num_windows(cfg.window) and not track.part(out).exists()]
-    if not left:
+    unfinished = [track for track in tracks if track.guess_num_windows(cfg.window) and not track.part(out).exists()]
+    if not unfinished:
         raise InputError("all tracks are captioned or too short", where=data, got=f"{len(tracks)} tracks")
-    chosen = [left[number * len(left) // num_windows] for number in range(num_windows)]
-    windows = [w for track in dict.fromkeys(chosen) for w in islice(track.windows(cfg), chosen.count(track))]
+    # Spread over the tracks; several windows of one track if there are fewer tracks than windows.
+    num_of_track = Counter(unfinished[number * len(unfinished) // num_windows] for number in range(num_windows))
+    windows = [window for track, count in num_of_track.items() for window in islice(track.windows(cfg), count)]
     exchanges: dict[str, list[tuple[Request, Reply]]] = {window.observed.sample_id: [] for window in windows}
 
     def record(sample_id: str, request: Request, reply: Reply) -> None:
@@ -75,38 +77,41 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
     if not any(isinstance(outcome, Caption) for outcome in outcomes):
         what, got = "none of the trial windows got an answer", next(map(str, outcomes), "no window")
         raise TeacherError(what, where=cfg.teacher, got=got)
-    for (sample_id, exchanged), outcome in zip(exchanges.items(), outcomes, strict=True):
+    for (sample_id, of_window), outcome in zip(exchanges.items(), outcomes, strict=True):
         yield f"=== {sample_id} ==="
-        before = None
-        for number, (request, reply) in enumerate(exchanged, 1):
-            yield from _exchange(number, request, reply, is_same=before == request.messages)
-            before = request.messages
+        previous = None
+        for number, (request, reply) in enumerate(of_window, 1):
+            if request.messages == previous:
+                yield f"--- request {number}, the same with another seed ---"
+            else:
+                yield from _question_lines(number, request)
+            yield from _answer_lines(number, reply)
+            previous = request.messages
         yield "--- outcome ---"
-        yield from _outcome(outcome) if isinstance(outcome, Caption) else [f"no answer: {for_terminal(str(outcome))}"]
-        if isinstance(outcome, Caption) and outcome.drop_reason == "structure" and not cfg.endpoint.json_schema:
-            yield "fix: remove caption.endpoint.json_schema=false, so that the server enforces the fields"
+        if isinstance(outcome, Caption):
+            yield from _outcome_lines(outcome)
+            if outcome.drop_reason == "structure" and not cfg.endpoint.json_schema:
+                yield "fix: remove caption.endpoint.json_schema=false, so that the server enforces the fields"
+        else:
+            yield f"no answer: {for_terminal(str(outcome))}"
 
 
-def _outcome(caption: Caption) -> Iterator[str]:
+def _outcome_lines(caption: Caption) -> Iterator[str]:
     """Yield the lines about a caption: its status, what was checked, and its texts."""
     reason, checks = caption.drop_reason, caption.checks
     yield caption.status if reason is None else f"dropped because of {reason}: {REASONS[reason]}"
-    told = [("label", caption.label), ("verdict", caption.verdict)]
-    told += [("structure", checks.structure), ("refusal", checks.refusal)]
-    told += [("contradicted", text) for text in checks.contradictions or ()]
+    facts = [("label", caption.label), ("verdict", caption.verdict)]
+    facts += [("structure", checks.structure), ("refusal", checks.refusal)]
+    facts += [("contradicted", text) for text in checks.contradictions or ()]
     for language, answer in (("en", caption.en), ("zh", caption.zh)):
-        told += [(language, text) for text in (answer.model_dump().values() if answer else ())]
-    yield from (f"{name}: {for_terminal(text)}" for name, text in told if text is not None)
+        if answer is not None:
+            facts += [(language, text) for text in answer.model_dump().values()]
+    yield from (f"{name}: {for_terminal(text)}" for name, text in facts if text is not None)
 
 
-def _exchange(number: int, request: Request, reply: Reply, *, is_same: bool) -> Iterator[str]:
-    """Yield the lines of a question, if it is not the same as the one before, and its answer.
-
-    A picture is its number and size.
-    """
-    if is_same:
-        yield f"--- request {number}, the same with another seed ---"
-    for message in () if is_same else request.messages:
+def _question_lines(number: int, request: Request) -> Iterator[str]:
+    """Yield the lines of a question; a picture is a line with its number and size."""
+    for message in request.messages:
         yield f"--- request {number}, {message['role']} ---"
         content, num_pictures = message["content"], 0
         parts: list[dict] = [{"type": "text", "text": content}] if isinstance(content, str) else content
@@ -116,6 +121,9 @@ def _exchange(number: int, request: Request, reply: Reply, *, is_same: bool) -> 
             else:
                 num_pictures += 1
                 yield f"[picture {num_pictures}, {len(part['image_url']['url']) / 1e3:.0f} kB]"
+
+
+def _answer_lines(number: int, reply: Reply) -> Iterator[str]:
     usage = reply.usage
     facts = [f"{usage.prompt_tokens} tokens in, {usage.completion_tokens} out" if usage else "tokens not reported"]
     if reason := find_object(reply.text, FIELDS, reply.finish_reason).reason:

@@ -85,26 +85,13 @@ class WindowLoop:
         self.checks = Checks(contradicted=self.contradicted)
         observed, pictures = window.observed, self.answered.pictures
         self.caption = Caption(
-            sample_id=observed.sample_id,
-            town=observed.town,
-            trajectory=observed.trajectory,
-            variant=observed.variant,
-            frame_index=observed.indices[-1],
-            window=list(observed.indices),
-            future=list(window.future.indices),
-            prompt=self.answered.prompts,
-            prompt_hash=prompt_hash(self.answered),
-            picture_px=pictures.size_px,
-            depth_range_m=pictures.depth_range_m if "depth" in pictures.views else None,
-            teacher=teacher.record,
-            usage=Usage(),
-            attempts=0,
-            writing=self.terms.writing,
-            label_from=window.future.label_from,
-            label=self.label,
-            checks=self.checks,
-            status="dropped",
-        )
+            sample_id=observed.sample_id, town=observed.town, trajectory=observed.trajectory, variant=observed.variant,
+            frame_index=observed.indices[-1], window=list(observed.indices), future=list(window.future.indices),
+            prompt=self.answered.prompts, prompt_hash=prompt_hash(self.answered), picture_px=pictures.size_px,
+            depth_range_m=pictures.depth_range_m if "depth" in pictures.views else None, teacher=teacher.record,
+            usage=Usage(), attempts=0, writing=self.terms.writing, label_from=window.future.label_from,
+            label=self.label, checks=self.checks, status="dropped",
+        )  # fmt: skip
 
     @property
     def english(self) -> Draft:

@@ -27,21 +27,20 @@ def current_frames(num_points: int, cfg: WindowConfig) -> range:
 
 
 def cut_windows(track: Track, cfg: WindowConfig, twin: Track | None = None) -> Iterator[Window]:
-    """Yield the windows of a track in order of time; none if the track is shorter than a window.
-
-    Args:
-        twin: The clean track of a perturbed one; futures are cut from it.
-    """
+    """Yield the windows of a track in order of time; none if the track is shorter than a window. Futures are cut from
+    the twin, the clean track of a perturbed one, if there is one."""
     motion, frames = label_motion(track, twin), frames_of(track)
     folders = [track.frame_folder(i) for i in range(len(track))]
     files = [files_in(folder) for folder in folders]
-    missing = {i for i, names in enumerate(files) if "rgb.png" not in names} if cfg.require_images else set()
+    without_picture = {i for i, names in enumerate(files) if "rgb.png" not in names}
     for current in current_frames(len(track), cfg):
-        span, mission = slice(current - cfg.num_frames + 1, current + 1), track.mission
+        mission = track.mission
         order = None if mission is None or mission.order_at(current) is None else mission.kind
-        observed = observe(track, frames, span, order, folders, files)
-        problem = "unusable_frame" if missing.intersection(observed.indices) else None
-        if problem is None and order_comes_within(track.mission, current, cfg.future_frames):
+        observed = observe(track, frames, slice(current - cfg.num_frames + 1, current + 1), order, folders, files)
+        problem = None
+        if cfg.require_images and without_picture.intersection(observed.indices):
+            problem = "unusable_frame"
+        elif order_comes_within(mission, current, cfg.future_frames):
             problem = "order_to_come"
         yield Window(observed, cut_future(track, motion, current, cfg.future_frames), problem)
 
@@ -49,7 +48,9 @@ def cut_windows(track: Track, cfg: WindowConfig, twin: Track | None = None) -> I
 def frames_of(track: Track) -> tuple[ObservedFrame, ...]:
     """Return what is observed of each frame of a track."""
     target, num_frames = track.target, len(track)
-    bystanders = np.full((num_frames, 5), np.nan) if track.bystanders is None else track.bystanders
+    bystanders = track.bystanders  # columns as COMPANY of cosfly/formats/frames.py
+    if bystanders is None:
+        bystanders = np.full((num_frames, 5), np.nan)
     return observed_frames(
         track.time_s,
         track.positions_m,
@@ -61,71 +62,50 @@ def frames_of(track: Track) -> tuple[ObservedFrame, ...]:
         target.visible,
         target.visibility,
         np.ones(num_frames, dtype=bool) if target.legible is None else target.legible,
-        *bystanders.T[[0, 1, 4]],
+        *bystanders.T[[0, 1, 4]],  # others_in_view, other_distance_m, alike_differences
     )
 
 
 def observe(
-    track: Track,
-    frames: tuple[ObservedFrame, ...],
-    span: slice,
-    order: str | None,
-    folders: Sequence[Path] = (),
+    track: Track, frames: tuple[ObservedFrame, ...], span: slice, order: str | None, folders: Sequence[Path] = (),
     files: Sequence[frozenset[str]] = (),
-) -> ObservedWindow:
-    """Return the observed frames of a track, without a reference to those that follow.
+) -> ObservedWindow:  # fmt: skip
+    """Return the frames of a span of a track, without a reference to those that follow.
 
     Args:
-        order: The kind of the mission whose order is in force. folders, files: Of the pictures of all frames, if there.
+        order: The kind of the mission whose order is in force, if one is.
+        folders: Of all frames, with the names of their files, if there are pictures.
     """
     goal, current = track.goal, span.stop - 1
     return ObservedWindow(
-        sample_id=sample_id(track.flight_id, current),
-        town=track.town,
-        trajectory=track.trajectory,
-        variant=track.variant,
-        indices=tuple(range(span.start, span.stop)),
-        width_px=track.camera.width_px,
-        height_px=track.camera.height_px,
-        frames=frames[span],
-        frame_folders=tuple(folders[span]),
-        frame_files=tuple(files[span]),
-        mission=order,
+        sample_id=sample_id(track.flight_id, current), town=track.town, trajectory=track.trajectory,
+        variant=track.variant, indices=tuple(range(span.start, span.stop)), width_px=track.camera.width_px,
+        height_px=track.camera.height_px, frames=frames[span], frame_folders=tuple(folders[span]),
+        frame_files=tuple(files[span]), mission=order,
         goal=None if goal is None or track.bystanders is None else {"en": goal.en, "zh": goal.zh},
-    )
+    )  # fmt: skip
 
 
 def order_comes_within(mission: Mission | None, current: int, future_frames: int) -> bool:
-    """Return whether an order moves the drone in the future of a frame at which it is not known yet.
-
-    The label of such a window does not follow from what is seen.
-    """
+    """Return whether an order moves the drone in the future of a frame at which it is not known yet, so that the label
+    does not follow from what is seen."""
     return mission is not None and current < mission.at_frame <= current + future_frames
 
 
 def cut_future(track: Track, motion: LabelMotion, current: int, future_frames: int) -> FutureMotion:
-    """Return the motion after frame `current`: without perturbation, or as recorded if that is not known.
-
-    Args:
-        motion: Of the whole track. Visibility comes from the track itself.
-    """
-    used = slice(current - 1, current + future_frames + 1)
-    if not all(motion.is_known[used]):
+    """Return the motion after frame `current`: that of the whole track without perturbation, or the recorded one if
+    that is not known. Visibility is always that of the track itself."""
+    if not all(motion.is_known[current - 1 : current + future_frames + 1]):
         motion = recorded_motion(track, "perturbed")
     span = slice(current, current + future_frames + 1)
     step_s = track.time_s[current] - track.time_s[current - 1]
     before_m, now_m = motion.positions_m[current - 1 : current + 1].tolist()
     return FutureMotion(
-        indices=tuple(range(current + 1, current + future_frames + 1)),
-        time_s=track.time_s[span],
-        positions_m=motion.positions_m[span],
-        yaw_deg=motion.yaw_deg[span],
-        targets_m=motion.targets_m[span],
-        visible=track.target.visible[span],
-        speed_before_mps=math.dist(now_m, before_m) / float(step_s),
-        label_from=motion.label_from,
-        order=None if track.mission is None else track.mission.order_at(current),
-    )
+        indices=tuple(range(current + 1, current + future_frames + 1)), time_s=track.time_s[span],
+        positions_m=motion.positions_m[span], yaw_deg=motion.yaw_deg[span], targets_m=motion.targets_m[span],
+        visible=track.target.visible[span], speed_before_mps=math.dist(now_m, before_m) / float(step_s),
+        label_from=motion.label_from, order=None if track.mission is None else track.mission.order_at(current),
+    )  # fmt: skip
 
 
 # --- the motion that labels come from ---------------------------------------------------------------------------------
@@ -136,12 +116,12 @@ def cut_future(track: Track, motion: LabelMotion, current: int, future_frames: i
 
 @dataclass(frozen=True)
 class LabelMotion:
-    """Poses of n frames. positions_m, targets_m: (n, 3); yaw_deg: (n,); NaN if not known."""
+    """Poses of n frames, NaN if not known."""
 
     label_from: LabelFrom
-    positions_m: np.ndarray
-    yaw_deg: np.ndarray
-    targets_m: np.ndarray
+    positions_m: np.ndarray  # (n, 3), of the drone
+    yaw_deg: np.ndarray  # (n,)
+    targets_m: np.ndarray  # (n, 3)
 
     @cached_property
     def is_known(self) -> list[bool]:
@@ -155,11 +135,8 @@ def recorded_motion(track: Track, label_from: LabelFrom) -> LabelMotion:
 
 
 def label_motion(track: Track, twin: Track | None = None) -> LabelMotion:
-    """Return the motion of a track without perturbation; NaN where the offsets are not recorded.
-
-    Args:
-        twin: The clean track of the same frames (`read_twin`), if there is one.
-    """
+    """Return the motion of a track without perturbation: that of its twin, the clean track of the same frames
+    (`read_twin`), or its own without the offsets, NaN where these are not recorded."""
     if track.is_original:
         return recorded_motion(track, "flight")
     if twin is not None:

@@ -56,10 +56,7 @@ class Finding:
 def examine_endpoint(
     url: str, cfg: CaptionConfig, vocabulary: Vocabulary, most_requests: int | None = None
 ) -> list[Finding]:
-    """Try an endpoint, which is usable if no finding is `unusable`, and show the progress.
-
-    Args:
-        most_requests: Stop after this number of requests.
+    """Try an endpoint, with at most `most_requests`, and show the progress. It is usable if no finding is `unusable`.
 
     Raises:
         TeacherError: The URL cannot be asked.

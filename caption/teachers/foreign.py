@@ -29,16 +29,12 @@ class ForeignCaption(Record):
 
 @dataclass(frozen=True)
 class Terms:
-    """How a teacher answers for a window.
-
-    Args:
-        is_given: It cannot be asked for again.
-        is_fixed: Asked once more or corrected, it gives the same answer, it has the paper's three fields alone, and its
-            Chinese is no translation.
-    """
+    """How a teacher answers for a window."""
 
     writing: Writing
-    is_given: bool = False
+    is_given: bool = False  # the answer is in a file: no other one can be asked for
+    # Asked again, the teacher gives the same answer; it has the paper's three fields only, and its Chinese is no
+    # translation.
     is_fixed: bool = False
     has_mirror: bool = True
 
@@ -73,20 +69,17 @@ def read_foreign(path: Path) -> Answers:
 
 
 def read_student(path: Path, run: str | None = None) -> tuple[Answers, str]:
-    """Read the predictions of a student for the windows of one tree; one that does not parse is refused later.
-
-    Args:
-        run: The tree, as the training set names it; None if all predictions are of one tree.
-    """
+    """Read the predictions of a student for the windows of one tree, `run` in the training set, None if all are of one
+    tree; a prediction that does not parse is refused later."""
     predictions = read_predictions(path)
     runs = ", ".join(sorted({prediction.run for prediction in predictions}))
     chosen = [prediction for prediction in predictions if run in (None, prediction.run)]
-    answers: Answers = {
-        (one.window_id or one.sample_id, one.language): one.reason
-        if one.reason and one.reason.startswith(FAILED)
-        else Reply(one.raw, None, "plain", "stop" if one.is_finished else "length")
-        for one in chosen
-    }
+    answers: Answers = {}
+    for prediction in chosen:
+        answer: Reply | str = Reply(prediction.raw, None, "plain", "stop" if prediction.is_finished else "length")
+        if prediction.reason and prediction.reason.startswith(FAILED):
+            answer = prediction.reason
+        answers[prediction.window_id or prediction.sample_id, prediction.language] = answer
     if len(answers) < len(chosen):
         fix = "choose one of these runs with --set caption.student.run=NAME"
         what = "the predictions are for several runs with the same track names"
@@ -94,7 +87,7 @@ def read_student(path: Path, run: str | None = None) -> tuple[Answers, str]:
     if not answers:
         what, got = f"the file contains no predictions for {run or 'any run'}", f"predictions for {runs or 'no run'}"
         raise InputError(what, where=path, got=got, fix="pass the output of cosfly distill infer for this run")
-    return answers, ", ".join(sorted({one.model or "a student" for one in chosen}))
+    return answers, ", ".join(sorted({prediction.model or "a student" for prediction in chosen}))
 
 
 class GivenTeacher:

@@ -37,15 +37,12 @@ _MEANINGS: dict[Judgement, str] = {
 
 
 class Conflict(Record):
-    """An answer whose decision is not the label.
-
-    flight_data: The question without its pictures. label: None if it is not known.
-    """
+    """An answer whose decision is not the label."""
 
     sample_id: str
-    flight_data: str
+    flight_data: str  # the question without its pictures
     answer: Coc
-    label: str | None
+    label: str | None  # None if it is not known
 
 
 def judge_messages(conflict: Conflict, vocabulary: Vocabulary, order: Sequence[Judgement] = JUDGEMENTS) -> list[dict]:
@@ -62,10 +59,10 @@ def judge_messages(conflict: Conflict, vocabulary: Vocabulary, order: Sequence[J
 
 def parse_judgement(text: str, finish_reason: str | None = None) -> tuple[str, str]:
     """Return the verdict and the reason of the last object of a text; `unjudged` if either is missing."""
-    found = find_object(text, ("verdict", "reason"), finish_reason)
-    if found.value is None:
-        return UNJUDGED, found.reason or ""
-    verdict, reason = found.value.get("verdict"), found.value.get("reason")
+    judgement = find_object(text, ("verdict", "reason"), finish_reason)
+    if judgement.value is None:
+        return UNJUDGED, judgement.reason or ""
+    verdict, reason = judgement.value.get("verdict"), judgement.value.get("reason")
     if verdict not in JUDGEMENTS:
         return UNJUDGED, f"unknown verdict: {str(verdict)[:40]}"
     if not isinstance(reason, str) or not reason.strip():
@@ -96,17 +93,9 @@ class Judge:
 
 @asynccontextmanager
 async def open_judge(
-    cfg: JudgeConfig,
-    vocabulary: Vocabulary,
-    seed: int,
-    book: AnswerBook | None = None,
-    budget: Budget | None = None,
+    cfg: JudgeConfig, vocabulary: Vocabulary, seed: int, book: AnswerBook | None = None, budget: Budget | None = None
 ) -> AsyncIterator[Judge | None]:
-    """Connect to the judge of the settings; None if they name none.
-
-    Args:
-        book: Journal of the answers. budget: None sets no limit.
-    """
+    """Connect to the judge of the settings, None if they name none; `book` is the journal of its answers."""
     if cfg.url is None:
         yield None
         return
@@ -136,17 +125,13 @@ def gold_conflicts() -> list[GoldConflict]:
 
 @dataclass(frozen=True)
 class JudgeCheck:
-    """How a judge did on the gold set. Every conflict is asked once per rotation of the options.
-
-    num_moved: Conflicts whose verdict depends on the order of the options. num_first: How often it took the option
-    named first. confusion: (gold, judged) -> count.
-    """
+    """How a judge did on the gold set. Every conflict is asked once per rotation of the options."""
 
     model: str
     num_conflicts: int
-    num_moved: int
-    num_first: int
-    confusion: Counter[tuple[str, str]]
+    num_moved: int  # conflicts whose verdict depends on the order of the options
+    num_first: int  # answers that took the option named first
+    confusion: Counter[tuple[str, str]]  # (gold, judged) -> answers
 
     @property
     def agreement(self) -> float:
@@ -191,10 +176,10 @@ async def check_judge(cfg: JudgeConfig, vocabulary: Vocabulary, gold: list[GoldC
                 advance(1)
                 return record
 
-            records = iter(await asyncio.gather(*(ask(conflict, order) for conflict in gold for order in orders)))
+            records = await asyncio.gather(*(ask(conflict, order) for conflict in gold for order in orders))
             model = f"{judge.kept.engine.model} at {judge.kept.engine.where}"
-    for conflict in gold:
-        verdicts = [next(records).verdict for _ in orders]
+    for k, conflict in enumerate(gold):
+        verdicts = [record.verdict for record in records[k * len(orders) : (k + 1) * len(orders)]]
         confusion.update((conflict.judgement, verdict) for verdict in verdicts)
         num_moved += len(set(verdicts)) > 1
         num_first += sum(verdict == order[0] for verdict, order in zip(verdicts, orders, strict=True))

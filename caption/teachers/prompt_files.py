@@ -24,17 +24,10 @@ SUFFIX, VERSION = ".txt", "# version: "
 
 @dataclass(frozen=True, eq=False)
 class Vocabulary:
-    """The prompts of a run.
+    """The prompts of a run. It is hashed by identity, so that caches of its prompts are fast."""
 
-    Hashed by identity, so that caches of its prompts are fast.
-
-    Args:
-        prompts: name of a prompt file -> its text, with its version line.
-        text_state: which flight data the questions contain.
-    """
-
-    prompts: Mapping[str, str]
-    text_state: TextState = "relative"
+    prompts: Mapping[str, str]  # name of a prompt file -> its text, with its version line
+    text_state: TextState = "relative"  # which flight data the questions contain
 
     @cached_property
     def templates(self) -> dict[str, Template]:
@@ -56,12 +49,12 @@ def own_prompts(folder: Path) -> dict[str, str]:
     export = "run cosfly caption prompts --export DIR to write the built-in prompts"
     if not folder.is_dir():
         raise ConfigError("the folder of prompts does not exist", where=folder, fix=export)
-    found, problems = dict[str, str](), list[str]()
+    prompts, problems = dict[str, str](), list[str]()
     for name in sorted({*shipped_prompts(), *(path.stem for path in folder.glob(f"*{SUFFIX}"))}):
         path = folder / f"{name}{SUFFIX}"
         try:
-            found[name] = read_text(path, what="prompt", tree=folder)
-            problems += _problems(path, found[name])
+            prompts[name] = read_text(path, what="prompt", tree=folder)
+            problems += _problems(path, prompts[name])
         except InputError as error:
             missing = f"{path}: the prompt is missing; copy it from the exported prompts"
             problems.append(str(error) if path.exists() else missing)
@@ -75,7 +68,7 @@ def own_prompts(folder: Path) -> dict[str, str]:
             expected="the files and slots of the built-in prompts",
             fix=f"{len(problems)} to fix; {export}",
         )
-    return found
+    return prompts
 
 
 def _problems(path: Path, text: str) -> Iterator[str]:

@@ -224,11 +224,7 @@ def question_messages(question: Question, frames: Frames) -> tuple[list[dict], l
 
 
 def mirror_messages(question: Question, english: Draft, complaint: str | None = None) -> list[dict]:
-    """Return the chat messages that ask for the Chinese mirror of an English answer.
-
-    Args:
-        complaint: what is wrong with an earlier one.
-    """
+    """Return the chat messages that ask for the Chinese mirror of an English answer, with a complaint about the last."""
     templates = question.vocabulary.templates
     glossary = "\n".join(f"{en} = {zh}" for en, zh in translations())
     system = templates[question.format.mirror_system].substitute(glossary=glossary)

@@ -68,14 +68,11 @@ STRIKING_TOPICS = ("view", "cover", "people", "place", "gap", "size")  # the fir
 
 
 def word_of(f: Facts, address: str) -> str | None:
-    """Return the word that is true at an address, None where none is known."""
-    key = ("word", address)
-    if key not in f.found:
-        reference = parse_reference(address)
-        assert reference is not None
-        fact = look_up(reference, f)
-        f.found[key] = str(fact.value) if isinstance(fact, Fact) else None
-    return f.found[key]  # type: ignore[no-any-return]
+    """Return the word that is true at an address, None if none is known."""
+    reference = parse_reference(address)
+    assert reference is not None
+    fact = look_up(reference, f)
+    return str(fact.value) if isinstance(fact, Fact) else None
 
 
 def says(address: str, word: str, *conditions: Condition) -> Condition:
@@ -154,13 +151,14 @@ def is_slower(f: Facts) -> bool:
     return now(f.speed_mps) < now(f.target_speeds_mps)
 
 
-def sets_off(f: Facts, side: int) -> bool:
-    return hurries(f, side) and (f.target_speeds_mps[0] or 0.0) < STILL_MPS
-
-
 def stands(f: Facts, side: int) -> bool:
     """Return whether the target stands, now and on the whole."""
-    return is_walk_known(f, side) and max(f.target_speed_mps or 0.0, now(f.target_speeds_mps)) < STILL_MPS
+    return is_walk_known(f, side) and fastest_walk_mps(f) < STILL_MPS
+
+
+def fastest_walk_mps(f: Facts) -> float:
+    """Return the speed of the target, the larger one of now and on the whole; 0 if it is not known."""
+    return max(f.target_speed_mps or 0.0, now(f.target_speeds_mps))
 
 
 def turns(f: Facts, side: int) -> bool:
@@ -238,14 +236,6 @@ def strafes_on(f: Facts, side: int) -> bool:
     if first_deg is None or last_deg is None or gap_opens(f, side) or not expects(FAMILIES["strafe"])(f, side):
         return False
     return side * last_deg >= -LITTLE_DEG and (is_shaken(f) or side * (last_deg - first_deg) >= -2 * DRIFT_DEG)
-
-
-def circles_on(f: Facts, side: int) -> bool:
-    return f.is_visible_now and expects(FAMILIES["circle"])(f, side)
-
-
-def nose_turns(f: Facts, side: int) -> bool:
-    return sight_turns(f, side) and side * f.yaw_deg[-1] >= LEAST_TURN_DEG
 
 
 def is_turn_slowing(f: Facts) -> bool:
@@ -350,23 +340,14 @@ def is_opposed(f: Facts, name: str, side: int) -> bool:
 
 def overtakes(f: Facts, side: int) -> bool:
     """Return whether the drone flies forward faster than the target walks, now and on the whole."""
-    fastest_walk_mps = max(f.target_speed_mps or math.inf, f.target_speeds_mps[-1] or math.inf)
-    return is_smooth(f, side) and walks_evenly(f, side) and f.velocity_mps[0] > fastest_walk_mps
-
-
-def strafes_round(f: Facts, side: int) -> bool:
-    """Return whether a strafe goes on around a target that hardly moves."""
-    return strafes_on(f, side) and max(f.target_speed_mps or 0.0, now(f.target_speeds_mps)) < SLOW_MPS
+    is_walking = f.target_speed_mps and f.target_speeds_mps[-1]
+    is_faster = bool(is_walking) and f.velocity_mps[0] > fastest_walk_mps(f)
+    return is_faster and is_smooth(f, side) and walks_evenly(f, side)
 
 
 def similar_near(f: Facts, side: int) -> bool:
     is_similar = f.alike_differences[-1] in range(MOST_DIFFERENCES + 1)  # None is not
     return f.is_visible_now and is_similar and _or_far(f.other_distance_m[-1]) <= COMING_M
-
-
-def turns_with_sight(f: Facts, side: int) -> bool:
-    """Return whether the nose turns to a side, and the line of sight turns with it."""
-    return side * now(f.yaw_rate_dps) >= TURNING_DPS and sight_turns(f, side)
 
 
 def expects_slow_down(f: Facts, side: int) -> bool:
@@ -379,14 +360,15 @@ def is_ordered(kind: str) -> Condition:
 
 # Conditions whose name in rule_sentences.yaml is that of their function.
 NAMED = (
-    stands, sets_off, turns, crosses, comes, walks_away, off_centre, sight_turns, drifts, nose_turns, turn_ends, slides,
-    strafes_on, strafes_round, circles_on, overtakes, gap_scatters, bystander_closes, similar_near, turns_with_sight,
+    stands, turns, crosses, comes, walks_away, off_centre, sight_turns, drifts, turn_ends, slides, strafes_on, overtakes,
+    gap_scatters, bystander_closes, similar_near, expects_slow_down,
 )  # fmt: skip
 CONDITIONS: dict[str, Condition] = {
     "always": lambda f, side: True,
     **{condition.__name__: condition for condition in NAMED},
     # The walk of the target.
     "walks": walks,
+    "sets_off": lambda f, side: hurries(f, side) and (f.target_speeds_mps[0] or 0.0) < STILL_MPS,
     "lingers": lambda f, side: is_walk_known(f, side) and now(f.target_speeds_mps) < DAWDLING_MPS,
     "slows": slows,
     "halts": lambda f, side: slows(f, side) and now(f.target_speeds_mps) < HALTED_MPS,
@@ -433,8 +415,12 @@ CONDITIONS: dict[str, Condition] = {
     "turns_steadily": lambda f, side: abs(now(f.yaw_rate_dps)) >= SLIGHT_DPS and is_bearing_steady(f),
     "turn_goes_on": lambda f, side: side * now(f.yaw_rate_dps) >= TURNING_DPS,
     "turns_back": lambda f, side: side * now(f.yaw_rate_dps) <= -TURNING_DPS,
+    "turns_with_sight": lambda f, side: side * now(f.yaw_rate_dps) >= TURNING_DPS and sight_turns(f, side),
+    "nose_turns": lambda f, side: sight_turns(f, side) and side * f.yaw_deg[-1] >= LEAST_TURN_DEG,
     "hovers_on": lambda f, side: (f.target_speed_mps or 0.0) < DAWDLING_MPS and expects(FAMILIES["hover"])(f, side),
+    "circles_on": lambda f, side: f.is_visible_now and expects(FAMILIES["circle"])(f, side),
     "strafes_to": lambda f, side: strafes_on(f, side) and side * now(f.bearing_deg) >= 1.0,
+    "strafes_round": lambda f, side: strafes_on(f, side) and fastest_walk_mps(f) < SLOW_MPS,
     "drone_hovers": says("drone_motion", "hovering", lambda f, side: now(f.speed_mps) < SLOW_MPS),
     "drone_brakes": says("trend:speed", "decreasing", is_smooth, is_crawling),
     "drone_crawls": lambda f, side: is_smooth(f, side) and is_crawling(f, side),
@@ -451,8 +437,7 @@ CONDITIONS: dict[str, Condition] = {
     "slides_past": lambda f, side: slides(f, -side) and sight_turns(f, side),
     # Bystanders, expected decisions and orders.
     "bystander_near": lambda f, side: f.is_visible_now and _or_far(f.other_distance_m[-1]) <= NEAR_M,
-    **{f"expects_{name}": expects(family) for name, family in FAMILIES.items()},
-    "expects_slow_down": expects_slow_down,
+    **{f"expects_{name}": expects(family) for name, family in FAMILIES.items() if name != "slow_down"},
     **{kind: is_ordered(kind) for kind in MISSION_KINDS},
 }
 
@@ -520,14 +505,11 @@ class Chooser:
 def write_templates(
     facts: Facts, draws: bytes, decision: str | None = None
 ) -> tuple[dict[str, str], dict[str, str]] | None:
-    """Write the English and the Chinese answer, with slots for the facts.
+    """Write the English and the Chinese answer, with slots for the facts; None if the observed frames hold no reason.
 
     Args:
         draws: random bytes, at least 24.
-        decision: the decision to justify (anchored); None takes the strongest one that has a reason.
-
-    Returns:
-        None where the observed frames hold no reason.
+        decision: to justify (anchored); None takes the strongest one that has a reason.
     """
     choose = Chooser(facts, draws)
     for token in [decision] if decision else ranked(facts):

@@ -75,15 +75,18 @@ def check_prompts(chat_format: ChatFormat, folder: Path, vocabulary: Vocabulary)
 
 
 def _is_of_template(user: str, language: Language, chat_format: ChatFormat, vocabulary: Vocabulary) -> bool:
-    """Return whether a question is the template of its language, filled with the student's pictures."""
+    """Return whether a question is the template of its language, filled with the student's pictures.
+
+    The template becomes a pattern: its slots are first marked by \\0, because re.escape would change a pattern in them.
+    """
     template = vocabulary.templates[f"user_{language}"]
-    pictures = [Pictures(look.views, look.size_px, "separate", look.depth_range_m) for look in chat_format.looks]
-    known = {
+    looks = [Pictures(look.views, look.size_px, "separate", look.depth_range_m) for look in chat_format.looks]
+    patterns = {
         "num_frames": str(chat_format.num_frames),
-        "pictures": "|".join(re.escape(one.sentence(language)) for one in pictures),
+        "pictures": "|".join(re.escape(pictures.sentence(language)) for pictures in looks),
     }
     pattern = re.escape(template.substitute({slot: f"\0{slot}\0" for slot in template.get_identifiers()}))
-    pattern = re.sub("\0(.+?)\0", lambda slot: f"(?:{known.get(slot[1], '.+?')})", pattern)
+    pattern = re.sub("\0(.+?)\0", lambda slot: f"(?:{patterns.get(slot[1], '.+?')})", pattern)
     return re.fullmatch(pattern + r"(\n.+)*", user) is not None  # lines of goal, other people and mission may follow
 
 
@@ -100,24 +103,24 @@ class TrainedStudent:
     def request(
         self, question: Question, language: Language, decision: str | None, frames: Frames, seed: int
     ) -> Request:
-        """Return the request in one language: a student translates nothing. A regeneration adds its sentences to the
-        English one, which the training did not have.
+        """Return the request in one language; a student does not translate. In English a regeneration adds its sentences
+        to the system prompt, although the training had none of them.
 
         Raises:
             TeacherError: The window has other pictures than those of the training.
         """
         pictures = question.pictures
-        wanted = {(look.views, look.size_px) for look in self.chat_format.looks}
-        if (pictures.views, pictures.size_px) not in wanted:
+        trained_with = {(look.views, look.size_px) for look in self.chat_format.looks}
+        if (pictures.views, pictures.size_px) not in trained_with:
             raise TeacherError(
                 "the pictures of this playback tree differ from those that the student was trained with",
-                where=question.window.sample_id,
-                got=_described(pictures.views, pictures.size_px),
-                expected=" or ".join(_described(*one) for one in sorted(wanted)),
+                where=question.window.sample_id, got=_described(pictures.views, pictures.size_px),
+                expected=" or ".join(_described(views, size_px) for views, size_px in sorted(trained_with)),
                 fix="pass tracks with such pictures, or train a student on pictures like these",
-            )
-        prompt, more = question.asked[language], regeneration_lines(question) if language == "en" else ""
-        prompt = prompt.model_copy(update={"system": prompt.system + more})
+            )  # fmt: skip
+        prompt = question.asked[language]
+        if language == "en":
+            prompt = prompt.model_copy(update={"system": prompt.system + regeneration_lines(question)})
         schema = answer_schema(decision, language, place=self.chat_format.decision)
         return student_request(prompt, frames, schema, self._sampling, seed)
 

@@ -1,4 +1,4 @@
-"""Teachers: what answers a `Question`.
+"""Teachers, which answer a `Question`.
 
 `RuleTeacher` is embedded and deterministic, `GivenTeacher` reads a file. `AskingTeacher` asks a language model through
 an engine (cosfly/llm); every answer is journaled before it is used. `ask` answers in English, `mirror` gives the
@@ -52,13 +52,13 @@ class RuleTeacher:
     def _answers(self, question: Question) -> tuple[dict[str, str], dict[str, str]]:
         """Return the English and the Chinese answer; a correction does not change them."""
         key = f"{question.window.sample_id}/{replace(question, correction=None).purpose}"
-        found = question.facts.found
-        if key not in found:
+        cache = question.facts.found
+        if key not in cache:
             draws = random_bytes(self.seed, "caption", key)
-            found[key] = write_templates(question.facts, draws, question.decision)
-        if found[key] is None:
+            cache[key] = write_templates(question.facts, draws, question.decision)
+        if cache[key] is None:
             raise NoAnswer("no_reason", f"no observed fact supports {question.decision or 'a decision'}", is_final=True)
-        return found[key]  # type: ignore[no-any-return]
+        return cache[key]  # type: ignore[no-any-return]
 
     async def ask(self, question: Question) -> Reply:
         english, _ = self._answers(question)
@@ -84,7 +84,10 @@ class AskingTeacher:
     """Asks a language model; threads read and encode its pictures. Made by `open_teacher`."""
 
     def __init__(self, cfg: CaptionConfig, seed: int, kept: KeptAnswers, threads: Executor) -> None:
-        self.cfg, self.seed, self.kept, self._threads = cfg, seed, kept, threads
+        self.cfg = cfg
+        self.seed = seed
+        self.kept = kept
+        self._threads = threads
         self.student = None if cfg.student.folder is None else TrainedStudent(cfg)
         self._encode = self.student.encode if self.student else encoded_image
         self._frames: dict[tuple[Path, Pictures], asyncio.Future[list[EncodedImage]]] = {}
@@ -97,22 +100,23 @@ class AskingTeacher:
         return self.student.terms if self.student else Terms(self.cfg.writing)
 
     async def ask(self, question: Question) -> Reply:
-        frames, purpose = await self._encoded(question), question.purpose
+        frames = await self._encoded(question)
         if self.student is not None:
             request = self.student.request(question, "en", question.decision, frames, question.ask)
         else:
             messages, digests = question_messages(question, frames)
             schema = answer_schema(question.decision, more=THEREFORE)
-            request = self.cfg.endpoint.request(messages, digests, schema, self._seed_of(question, purpose))
-        return await self._kept_answer(question, purpose, request)
+            request = self.cfg.endpoint.request(messages, digests, schema, self._seed_of(question, question.purpose))
+        return await self._kept_answer(question, question.purpose, request)
 
     async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply:
         purpose, decision = f"mirror/{ask}", english.coc.flight_decision
-        if self.student is not None:  # about the same window; its own decision, unless the English one was given
+        if self.student is not None:  # answers about the window again, freely unless the English decision was given
             given = decision if question.decision else None
             request = self.student.request(question, "zh", given, await self._encoded(question), ask)
         else:
-            messages, schema = mirror_messages(question, english, complaint), answer_schema(decision, "zh")
+            messages = mirror_messages(question, english, complaint)
+            schema = answer_schema(decision, "zh")
             request = self.cfg.endpoint.request(messages, [], schema, self._seed_of(question, purpose))
         return await self._kept_answer(question, purpose, request)
 
@@ -122,7 +126,8 @@ class AskingTeacher:
 
     async def _encoded(self, question: Question) -> list[list[EncodedImage]]:
         """Return the pictures of each frame; threads read and encode a frame once for the windows that share it."""
-        loop, frames = asyncio.get_running_loop(), []
+        loop = asyncio.get_running_loop()
+        frames = []
         for folder in question.window.frame_folders:
             key = (folder, question.pictures)
             if key not in self._frames:

@@ -17,8 +17,7 @@ from cosfly.formats.captions import TOKENS
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Over the whole future (2.5 s by default). absent_share: a decision of which the flight shows less than this share
-    of its threshold is contradicted."""
+    """Sizes of the motion over the whole future (2.5 s by default)."""
 
     yaw_deg: float = 3.0  # makes a turn
     hard_turn_deg: float = 10.0  # contradicts track_straight
@@ -30,7 +29,7 @@ class Thresholds:
     lateral_m: float = 1.0
     approach_m: float = 1.0  # change of the horizontal distance to the target
     circle_deg: float = 15.0  # angle swept round the target
-    absent_share: float = 0.25
+    absent_share: float = 0.25  # a decision is contradicted if less than this share of its threshold is shown
 
 
 @dataclass(frozen=True)
@@ -57,60 +56,53 @@ class Motion:
 def measure(future: FutureMotion) -> Motion:
     """Measure a future; invariant to translation, to rotation about z and to a shift in time."""
     # As lists: numpy takes several times as long for a few numbers.
-    positions, yaw_deg, targets = future.positions_m.tolist(), future.yaw_deg.tolist(), future.targets_m.tolist()
+    positions = future.positions_m.tolist()
+    yaw_deg = future.yaw_deg.tolist()
     times_s = future.time_s.tolist()
+    visible = future.visible.tolist()
+    first_x, first_y, first_z = positions[0]
+    last_x, last_y, last_z = positions[-1]
+    (first_target_x, first_target_y, _), *_, (last_target_x, last_target_y, _) = future.targets_m.tolist()
     duration_s = times_s[-1] - times_s[0]
     mean_speed_mps = sum(map(math.dist, positions, positions[1:])) / duration_s
-    first, last = positions[0], positions[-1]
-    first_target, last_target = targets[0], targets[-1]
-    moved_x, moved_y = last[0] - first[0], last[1] - first[1]
+    moved_x, moved_y = last_x - first_x, last_y - first_y
     yaw_rad = math.radians(yaw_deg[0])
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     forward_m = moved_x * cos + moved_y * sin
-    # Drone seen from the target, at both ends.
-    x0, y0 = first[0] - first_target[0], first[1] - first_target[1]
-    x1, y1 = last[0] - last_target[0], last[1] - last_target[1]
-    visible = future.visible.tolist()
+    # The drone seen from the target, at both ends.
+    x0, y0 = first_x - first_target_x, first_y - first_target_y
+    x1, y1 = last_x - last_target_x, last_y - last_target_y
     return Motion(
-        yaw_deg=sum([(b - a + 180.0) % 360.0 - 180.0 for a, b in pairwise(yaw_deg)]),
-        altitude_m=last[2] - first[2],
-        mean_speed_mps=mean_speed_mps,
-        speed_change_mps=mean_speed_mps - future.speed_before_mps,
-        forward_gain_mps=forward_m / duration_s - future.speed_before_mps,
-        forward_m=forward_m,
-        left_m=moved_y * cos - moved_x * sin,
-        approach_m=math.hypot(x0, y0) - math.hypot(x1, y1),
-        closing_m=math.hypot(x0, y0) - math.hypot(last[0] - first_target[0], last[1] - first_target[1]),
+        yaw_deg=sum([(b - a + 180.0) % 360.0 - 180.0 for a, b in pairwise(yaw_deg)]), altitude_m=last_z - first_z,
+        mean_speed_mps=mean_speed_mps, speed_change_mps=mean_speed_mps - future.speed_before_mps,
+        forward_gain_mps=forward_m / duration_s - future.speed_before_mps, forward_m=forward_m,
+        left_m=moved_y * cos - moved_x * sin, approach_m=math.hypot(x0, y0) - math.hypot(x1, y1),
+        closing_m=math.hypot(x0, y0) - math.hypot(last_x - first_target_x, last_y - first_target_y),
         sweep_deg=-math.degrees(math.atan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1)),
-        target_path_m=math.hypot(last_target[0] - first_target[0], last_target[1] - first_target[1]),
-        visible_now=visible[0],
-        visible_share=sum(visible[1:]) / (len(visible) - 1),
-        order=future.order,
-    )
+        target_path_m=math.hypot(last_target_x - first_target_x, last_target_y - first_target_y),
+        visible_now=visible[0], visible_share=sum(visible[1:]) / (len(visible) - 1), order=future.order,
+    )  # fmt: skip
 
 
 Measure = Callable[[Motion], float]
 
 
 def _least(*sizes: float) -> float:
-    """Return the least size. One that cannot be measured (NaN, the angle round a target that nobody knows) is none."""
-    return min((size for size in sizes if size == size), default=math.nan)
+    """Return the least size, without those that cannot be measured (NaN), as around a target at an unknown place."""
+    return min((size for size in sizes if not math.isnan(size)), default=math.nan)
 
 
 def _holds(fact: bool) -> float:
+    """Return the size of a fact that holds or not."""
     return 1.0 if fact else -1.0
 
 
 class Rule(NamedTuple):
-    """How much there is of an action in a motion.
+    """How much there is of an action in a motion."""
 
-    implied: What makes it the label, from 1 on. shown: What speaks for it, negative for its opposite. least: Less
-    shown than this contradicts it.
-    """
-
-    implied: Measure
-    shown: Measure
-    least: float
+    implied: Measure  # makes the action the label, from 1 on
+    shown: Measure  # speaks for the action, or, if negative, for its opposite
+    least: float  # less shown than this contradicts the action
 
 
 def _rules(t: Thresholds) -> tuple[dict[str, Rule], ...]:
@@ -134,9 +126,9 @@ def _rules(t: Thresholds) -> tuple[dict[str, Rule], ...]:
             return _least(m.left_m / (side * t.lateral_m), m.sweep_deg / (side * t.circle_deg))
 
         def implied(m: Motion) -> float:
-            # The target moves less than the drone: to follow it through a bend is no circle.
-            is_round = abs(m.approach_m) < t.approach_m and m.target_path_m < 0.5 * abs(m.left_m)
-            return shown(m) if is_round else 0.0
+            keeps_distance = abs(m.approach_m) < t.approach_m
+            hardly_walks = m.target_path_m < 0.5 * abs(m.left_m)  # to follow it through a bend is no circle
+            return shown(m) if keeps_distance and hardly_walks else 0.0
 
         return rule(implied, shown)
 
@@ -145,9 +137,9 @@ def _rules(t: Thresholds) -> tuple[dict[str, Rule], ...]:
         return rule(lambda m: m.yaw_deg / (side * t.yaw_deg), least=-1.0)
 
     def strafe(side: int) -> Rule:
-        """Return the rule of a shift to one side. A drone that swings round the person shifts to one side and turns to
-        the other to keep its aim. That is one motion, a turn to follow: which of its parts is more thresholds tells
-        only the distance (1 m is 3 degrees at 19 m)."""
+        """Return the rule of a shift to one side. A drone that swings around the person shifts to one side and turns to
+        the other to keep its aim. That is one motion, a turn to follow; which of its two parts has the larger size
+        depends on the distance alone (1 m is 3 degrees at 19 m)."""
 
         def shown(m: Motion) -> float:
             return m.left_m / (side * t.lateral_m)
@@ -206,16 +198,16 @@ class ActionTable:
 
     def __init__(self, thresholds: Thresholds = Thresholds()) -> None:
         self.groups = _rules(thresholds)
-        found = {token: rule for group in self.groups for token, rule in group.items()}
-        self.rules = {token: found[token] for token in TOKENS}
+        rules = {token: rule for group in self.groups for token, rule in group.items()}
+        self.rules = {token: rules[token] for token in TOKENS}
 
     def label_of(self, motion: Motion) -> str | None:
-        """Return the ground-truth decision, None where neither an order nor geometry tells."""
+        """Return the ground-truth decision, None if neither an order nor geometry implies one."""
         for group in self.groups:
             sizes = {token: rule.implied(motion) for token, rule in group.items()}
-            found = [token for token, size in sizes.items() if size >= 1.0]
-            if found:
-                return max(found, key=sizes.__getitem__)  # the earlier one of two equal ones
+            implied = [token for token, size in sizes.items() if size >= 1.0]
+            if implied:
+                return max(implied, key=sizes.__getitem__)  # the earlier one of two equal ones
         return None
 
     def contradicted_by(self, motion: Motion, label: str | None) -> list[str]:

@@ -107,11 +107,7 @@ class Facts:
 
 
 def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = None) -> Facts:
-    """Measure a window. Reads nothing but the window.
-
-    Args:
-        picture_px: (width, height) of the pictures that are shown, to which pixels refer; None: the camera's own.
-    """
+    """Measure a window. Pixels refer to the pictures that are shown, (width, height); None: the camera's own."""
     camera_px = (window.width_px, window.height_px)
     picture_px = picture_px or camera_px
     frames = window.frames

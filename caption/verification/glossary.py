@@ -45,6 +45,7 @@ def form_after(before: str) -> int:
 
 @cache
 def _before_forms() -> dict[int, re.Pattern[str]]:
+    """Return form of a verb -> pattern of the words before it, the longest first: after "has", "to", "is"."""
     words = _glossary()["before_forms"]
     adverbs = rf"(?:\s+(?:{'|'.join(words['adverbs'])}))*\s*$"
     patterns = {form: "|".join(words["patterns"][form]) for form in (2, 3, 1)}
@@ -104,11 +105,8 @@ def written_units(language: Language) -> dict[str, Unit]:
 
 @cache
 def mentions(kind: str, name: str, language: Language) -> re.Pattern[str]:
-    """Return the pattern that finds a mention.
-
-    Args:
-        kind: a list of patterns. name: of a quantity or subject, "" of the other lists.
-    """
+    """Return the pattern that finds a word of a list of the glossary, such as `comparatives`, or of one quantity or
+    subject (`name`, otherwise "") of a list of these."""
     words = _glossary()[kind]
     options = "|".join((words[name] if name else words)[language])
     return re.compile(rf"\b(?:{options})\b" if language == "en" else f"(?:{options})", re.IGNORECASE)
@@ -127,7 +125,9 @@ def stands_at(kind: str, before: str, after: str, language: Language) -> bool:
 
 @cache
 def _around(kind: str, language: Language) -> tuple[re.Pattern[str], re.Pattern[str]]:
-    ahead, behind = ("|".join(_glossary()["around_numbers"][kind][side][language]) for side in ("before", "behind"))
+    """Return the patterns of the words before and behind a number."""
+    words = _glossary()["around_numbers"][kind]
+    ahead, behind = "|".join(words["before"][language]), "|".join(words["behind"][language])
     return re.compile(rf"(?:{ahead})\s*$", re.IGNORECASE), re.compile(rf"\s*(?:{behind})", re.IGNORECASE)
 
 
@@ -137,12 +137,14 @@ def ends_of_clauses(language: Language) -> re.Pattern[str]:
 
 
 def is_negated(text: str, start: int, language: Language) -> bool:
-    """Return whether a negation stands just before a place of a text (English in small letters)."""
+    """Return whether a negation stands just before a place of a text (English in small letters): within two words of
+    its clause."""
     negations = _glossary()["negations"][language]
     if language == "zh":
         return text[max(0, start - 4) : start].endswith(tuple(negations))
-    words = re.findall(r"[a-z']+", re.split(r"[.,;:]", text[max(0, start - 24) : start])[-1])
-    return bool(set(negations).intersection(words[-2:]))
+    clause = re.split(r"[.,;:]", text[max(0, start - 24) : start])[-1]  # two words take no more than 24 characters
+    words_before = re.findall(r"[a-z']+", clause)[-2:]
+    return not set(negations).isdisjoint(words_before)
 
 
 def swapped_opposite(english: str, chinese: str) -> str | None:
@@ -158,7 +160,8 @@ def swapped_opposite(english: str, chinese: str) -> str | None:
 
 def count_opposites(text: str, language: Language) -> Counter[tuple[str, int]]:
     """Count the opposites of a text: (name, 1 for the first of its two sides, -1 for the other), negations applied."""
-    (pattern, opposites), counts = _opposites(language), Counter[tuple[str, int]]()
+    pattern, opposites = _opposites(language)
+    counts = Counter[tuple[str, int]]()
     text = text.lower() if language == "en" else text
     for match in pattern.finditer(text):
         if match.group() in opposites:

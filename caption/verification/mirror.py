@@ -1,8 +1,7 @@
-"""Are the two languages of a caption one record?
+"""Checks that the two languages of a caption say the same.
 
-`check_mirror` holds for any pair of texts: same decision, each in its own script, compatible numbers, no opposite
-swapped. A text that was asked for as a translation must also have the same sentences and the glossary's terms
-(`check_translation`).
+`check_mirror` is for any pair of texts: same decision, each in its own script, compatible numbers, no opposite swapped.
+`check_translation` is for a text that was asked for as a translation: same sentences, and the glossary's terms.
 """
 
 from collections.abc import Sequence
@@ -25,21 +24,24 @@ def check_mirror(english: Coc, chinese: Coc, facts: Facts) -> str | None:
     """
     if english.flight_decision != chinese.flight_decision:
         return "decision"
-    texts: dict[Language, list[str]] = {"en": _texts(english), "zh": _texts(chinese)}
-    for language, both in texts.items():
-        if not all(is_in_script(part, language) for text in both for part in cut_sentences(text)):
-            return "script"
-    numbers_en, numbers_zh = (_numbers(both, language) for language, both in texts.items())
+    texts_en, texts_zh = _texts(english), _texts(chinese)
+    if not (_are_in_script(texts_en, "en") and _are_in_script(texts_zh, "zh")):
+        return "script"
+    numbers_en, numbers_zh = _numbers(texts_en, "en"), _numbers(texts_zh, "zh")
     series = _measured_series(facts)
     for numbers, others in ((numbers_en, numbers_zh), (numbers_zh, numbers_en)):
         if not all(_is_shared(number, others, series) for number in numbers):
             return "number"
-    swapped = swapped_opposite(*map("".join, texts.values()))
+    swapped = swapped_opposite("".join(texts_en), "".join(texts_zh))
     return f"polarity_{swapped}" if swapped else None
 
 
 def _texts(coc: Coc) -> list[str]:
     return [coc.critical_components, coc.reasoning_trace]
+
+
+def _are_in_script(texts: Sequence[str], language: Language) -> bool:
+    return all(is_in_script(part, language) for text in texts for part in cut_sentences(text))
 
 
 def _measured_series(f: Facts) -> dict[str, list[Series]]:
@@ -53,23 +55,26 @@ def _measured_series(f: Facts) -> dict[str, list[Series]]:
 
 
 def _numbers(texts: Sequence[str], language: Language) -> list[Numeral]:
-    """Return the numbers of texts, durations aside."""
-    found = (numeral for text in texts for numeral in read_numerals(text, language))
-    return [numeral for numeral in found if numeral.unit not in ("s", "times")]
+    """Return the numbers of texts without durations and factors."""
+    numerals = (numeral for text in texts for numeral in read_numerals(text, language))
+    return [numeral for numeral in numerals if numeral.unit not in ("s", "times")]
 
 
 def _is_shared(number: Numeral, others: Sequence[Numeral], measured: dict[str, list[Series]]) -> bool:
-    """Return whether a number stands in the other language, or is measured or a difference of two such numbers."""
+    """Return whether a number occurs in the other language or in a measured series, or is a difference of two numbers
+    of one of these."""
     if not number.unit and number.digits == 0 and number.value < 10:
         return True  # a count ("5 frames"), which the other language may write as a word
-    pools: list[Series] = [[other.value for other in others if not number.unit or other.unit in ("", number.unit)]]
-    pools += [one for unit, series in measured.items() if number.unit in ("", unit) for one in series]
-    step = 0.5 * 10.0**-number.digits + 1e-9
-    for pool in pools:
-        known = [abs(value) for value in pool if value is not None]
+    candidates: list[Series] = [[other.value for other in others if not number.unit or other.unit in ("", number.unit)]]
+    for unit, all_series in measured.items():
+        if number.unit in ("", unit):
+            candidates += all_series
+    rounding = 0.5 * 10.0**-number.digits + 1e-9
+    for series in candidates:
+        known = [abs(value) for value in series if value is not None]
         if any(abs(number.value - value) < 1e-9 for value in known):
             return True
-        if number.value > 0 and any(abs(number.value - (a - b)) < step for a, b in product(known, known)):
+        if number.value > 0 and any(abs(number.value - (a - b)) < rounding for a, b in product(known, known)):
             return True
     return False
 
@@ -77,7 +82,8 @@ def _is_shared(number: Numeral, others: Sequence[Numeral], measured: dict[str, l
 def check_translation(english: Coc, chinese: Coc) -> tuple[str, str] | None:
     """Compare a translation with its source; return the reason and what is missing, None where they agree."""
     for name in TEXTS:
-        count_en, count_zh = (len(cut_sentences(getattr(coc, name))) for coc in (english, chinese))
+        count_en = len(cut_sentences(getattr(english, name)))
+        count_zh = len(cut_sentences(getattr(chinese, name)))
         if count_en != count_zh:
             counts = f"{count_en} sentences in English and {count_zh} in Chinese"
             return "sentences", f"{name} has {counts}; write one for each"

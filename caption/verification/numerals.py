@@ -12,23 +12,16 @@ _NO_UNIT = Unit("", 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Numeral:
-    """A number of a text in our units.
-
-    Args:
-        unit: a key of the glossary's units, "" where none stands behind the number.
-        digits: after the point, as written. factor: from the unit that is written to ours.
-        bound: 1 of "more than 20 m", -1 of "less than". is_about: written as approximate.
-        start: position in the text.
-    """
+    """A number of a text in our units."""
 
     text: str
     value: float
-    unit: str
-    digits: int
-    factor: float = 1.0
-    bound: int = 0
-    is_about: bool = False
-    start: int = 0
+    unit: str  # a key of the glossary's units, "" if no unit stands behind the number
+    digits: int  # after the point, as written
+    factor: float = 1.0  # from the unit that is written to ours
+    bound: int = 0  # 1 of "more than 20 m", -1 of "less than 20 m"
+    is_about: bool = False  # written as approximate
+    start: int = 0  # position in the text
 
     @property
     def half(self) -> float:
@@ -36,6 +29,7 @@ class Numeral:
         return 0.5 * 10.0**-self.digits * self.factor
 
 
+# "Speed per hour" or "in each hour" shortly before a number: 时速 26 公里 is 26 km/h.
 _HOURLY = re.compile(r"(?:时速|每小时)[^，。；]{0,4}$")
 _SQUARED = re.compile(r"\s?(?:²|\^2|\*\*2|/s\b)")  # an acceleration
 _DIGITS = r"(?:(?<![A-Za-z0-9_.])|(?<=\d[x×]))[-+−]?\d+(?:\.\d+)?(?!\d)"
@@ -51,12 +45,9 @@ def _pattern(language: Language) -> re.Pattern[str]:
 
 
 def read_numerals(text: str, language: Language) -> list[Numeral]:
-    """Find the numbers of a text. Numbers in words are not read.
-
-    A count without a unit ("5 frames") is none; a duration is one, in seconds.
-    """
+    """Find the numbers of a text in digits. Counts ("5 frames") are not among them; durations are, in seconds."""
     units = written_units(language)
-    found: list[Numeral] = []
+    numerals: list[Numeral] = []
     for match in _pattern(language).finditer(text):
         spelling = match["unit"] or ""
         unit, factor = units.get(spelling.lower(), _NO_UNIT)
@@ -67,21 +58,23 @@ def read_numerals(text: str, language: Language) -> list[Numeral]:
             continue
         if language == "zh" and unit in ("m", "deg") and "每秒" in re.split("[，；。：、,;:]", before)[-1]:
             unit = {"m": "mps", "deg": "dps"}[unit]
-        if language == "zh" and (unit, factor) == ("m", 1000.0) and _HOURLY.search(before):  # 时速 26 公里
+        if language == "zh" and (unit, factor) == ("m", 1000.0) and _HOURLY.search(before):
             unit, factor = "mps", 1 / 3.6
         number = _number_of(match, unit)
         if number is None:
             continue
-        bounds = [bound for kind, bound in (("more", 1), ("less", -1)) if stands_at(kind, before, after, language)]
-        found.append(Numeral(
-            match.group().strip(), number[0] * factor, unit, number[1], factor, bound=bounds[0] if bounds else 0,
-            is_about=stands_at("about", before, after, language), start=match.start(),
-        ))  # fmt: skip
-    return found
+        value, digits = number
+        bound = -1 if stands_at("less", before, after, language) else 0
+        if stands_at("more", before, after, language):
+            bound = 1
+        is_about = stands_at("about", before, after, language)
+        text = match.group().strip()
+        numerals.append(Numeral(text, value * factor, unit, digits, factor, bound, is_about, match.start()))
+    return numerals
 
 
 def _number_of(match: re.Match[str], unit: str) -> tuple[float, int] | None:
-    """Return the value and its digits after the point; None of a count."""
+    """Return the value of a number and its digits after the point; None if it is a count."""
     half = 0.5 if match.groupdict().get("half") else 0.0
     written = match["digits"].replace("−", "-")
     digits, value = len(written.partition(".")[2]), abs(float(written)) + half

@@ -32,11 +32,7 @@ class ValueCheck(NamedTuple):
 
 
 def check_values(sentences: Sequence[str], facts: Facts, language: Language, filled: int = 0) -> ValueCheck:
-    """Compare the numbers of a text with the facts of its window.
-
-    Args:
-        sentences: in order; without the slots that were filled. filled: number of these.
-    """
+    """Compare the numbers of a text with the facts of its window. `filled` slots are not in its sentences any more."""
     matched = 0
     is_hypothetical = mentions("hypothetical", "", language)
     contradictions: list[str] = []
@@ -187,11 +183,7 @@ def _matches_any(numeral: Numeral, name: str, facts: Facts) -> bool:
 
 
 def _matches(numeral: Numeral, fact: float, rounding: float) -> bool:
-    """Return whether a number is a fact, to the digits with which it is written.
-
-    Args:
-        rounding: how far the fact itself may be off.
-    """
+    """Return whether a number is a fact, to the digits with which it is written; the fact may be off by `rounding`."""
     value = numeral.value
     slack = max(numeral.half, rounding) + 1e-9
     if numeral.factor != 1.0:

@@ -262,7 +262,7 @@ class LocalEngine(PromptedEngine):
             return [EngineDecision("late", answer_s=answer_s)] * len(results)
         decisions = []
         for result, question in zip(results, questions, strict=True):
-            answer = result.found
+            answer = result.result
             if isinstance(answer, BookAnswer):
                 time_s = answer_s if result.is_new else None
                 decisions.append(self._read(answer.text, question, time_s, answer.finish_reason))

@@ -34,25 +34,22 @@ WAITING = 16
 
 
 class Completion(NamedTuple):
-    """An answer. num_tokens: without its end token. is_finished: it ended by itself."""
+    """An answer."""
 
     text: str
-    num_tokens: int
-    is_finished: bool
+    num_tokens: int  # without its end token
+    is_finished: bool  # it ended by itself
 
 
 def generate(
-    student: Student, rows: Sequence[EncodedSample], pictures: Sequence[Tensors], *, max_tokens: int, stop: str = ""
+    student: Student, rows: Sequence[EncodedSample], features: Sequence[Tensors], *, max_tokens: int, stop: str = ""
 ) -> list[Completion]:
-    """Answer a batch of prompts greedily; the answers in `rows` are not used.
+    """Answer a batch of prompts greedily, in their order; the answers in `rows` are not used.
 
     Args:
-        pictures: features of the pictures of all rows, row after row.
+        features: of the pictures of all rows, row after row.
         max_tokens: longest answer, the end token included.
         stop: an answer ends before this text as well.
-
-    Returns:
-        One answer for each row, in their order.
     """
     import torch
     from transformers import GenerationConfig
@@ -73,10 +70,10 @@ def generate(
     )
     core.generation_config = config  # settings for sampling of the model folder would complete those of `config`
     student.model.eval()
-    with torch.inference_mode(), student.computing(), with_encoded_pictures(student, pictures) as seen:
-        found = core.generate(**inputs, **seen, tokenizer=student.tokenizer)
+    with torch.inference_mode(), student.computing(), with_encoded_pictures(student, features) as picture_inputs:
+        sequences = core.generate(**inputs, **picture_inputs, tokenizer=student.tokenizer)
     completions = []
-    for tokens in found[:, num_prompt:].tolist():
+    for tokens in sequences[:, num_prompt:].tolist():
         written = tokens[: tokens.index(end)] if end in tokens else [token for token in tokens if token != pad]
         text = student.tokenizer.decode(written, skip_special_tokens=False).removeprefix(student.lead)
         text, stopped, _ = text.partition(stop) if stop else (text, "", "")
@@ -107,13 +104,15 @@ class LocalAnswers:
         self.model = inputs.name
         self.batch_size = cfg.batch_size
         self.max_tokens = cfg.max_new_tokens
-        self.max_pixels = cfg.max_pixels or inputs.taught_pixels
+        self.max_pixels = cfg.max_pixels or inputs.training_pixels
         self._stop = stop
         self._reader = PictureReader(self.student, inputs.trees, self.max_pixels)
 
     async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[SampleOutcome, None]:
         """Yield the outcome of each sample, in their order; `advance` is called after each batch."""
-        rest = iter(samples if self.student.has_pictures else (sample.without_pictures() for sample in samples))
+        if not self.student.has_pictures:
+            samples = (sample.without_pictures() for sample in samples)
+        rest = iter(samples)
         while batch := list(islice(rest, self.batch_size)):
             recorded = [self.book.get(flight_of(sample.sample_id), self._key(sample)) for sample in batch]
             # Without one of the answers the whole batch is answered again: rounding may depend on what is in it.
@@ -121,9 +120,8 @@ class LocalAnswers:
             outcomes = [
                 answered[i] if answer is None else SampleOutcome(batch[i], answer) for i, answer in enumerate(recorded)
             ]
-            new = [outcome.found for outcome in outcomes if outcome.is_new]
-            answers = [answer for answer in new if isinstance(answer, Answer)]
-            await asyncio.gather(*(self.book.put(flight_of(answer.sample_id), answer) for answer in answers))
+            new = [outcome.result for outcome in outcomes if outcome.is_new and isinstance(outcome.result, Answer)]
+            await asyncio.gather(*(self.book.put(flight_of(answer.sample_id), answer) for answer in new))
             advance(len(batch))
             for outcome in outcomes:
                 yield outcome
@@ -134,23 +132,23 @@ class LocalAnswers:
         return sha256_bytes(dump_json([self.model, sample.sample_id, asked, self.max_tokens, self._stop]).encode())
 
     def _answer(self, batch: list[Sample]) -> list[SampleOutcome]:
-        """Answer a batch."""
+        """Answer a batch. A sample with a picture that cannot be read, or that cannot be encoded, fails."""
         pictures = list(dict.fromkeys(picture for sample in batch for picture in pictures_of(sample)))
-        features = read_features(self.student, pictures, map(self._reader.try_to_read, pictures))
-        rows: dict[int, EncodedSample] = {}
-        seen: dict[int, list[Tensors]] = {}
+        by_picture = read_features(self.student, pictures, map(self._reader.try_to_read, pictures))
+        rows: dict[int, EncodedSample] = {}  # by the sample's place in the batch, as the following ones
+        features: dict[int, list[Tensors]] = {}
         outcomes: dict[int, SampleOutcome] = {}
         for i, sample in enumerate(batch):
-            encoded = [features[picture] for picture in pictures_of(sample)]
+            results = [by_picture[picture] for picture in pictures_of(sample)]
             try:
-                if errors := [message for message in encoded if isinstance(message, str)]:
+                if errors := [message for message in results if isinstance(message, str)]:
                     raise InputError(errors[0])
                 rows[i] = self.student.encode(sample, self.max_pixels)
-                seen[i] = [tensors for tensors in encoded if not isinstance(tensors, str)]
+                features[i] = [tensors for tensors in results if not isinstance(tensors, str)]
             except InputError as error:
                 outcomes[i] = SampleOutcome.failed(sample, error.code, error)
         start_s = time.monotonic()
-        completions = self._decode([*rows.values()], [*seen.values()]) if rows else []
+        completions = self._decode([*rows.values()], [*features.values()]) if rows else []
         latency_s = round(time.monotonic() - start_s, 3)
         for (i, row), completion in zip(rows.items(), completions, strict=True):
             answer = Answer(
@@ -162,20 +160,20 @@ class LocalAnswers:
             outcomes[i] = SampleOutcome(batch[i], answer, is_new=True)
         return [outcomes[i] for i in range(len(batch))]
 
-    def _decode(self, rows: Sequence[EncodedSample], pictures: Sequence[list[Tensors]]) -> list[Completion]:
+    def _decode(self, rows: Sequence[EncodedSample], features: Sequence[list[Tensors]]) -> list[Completion]:
         """Answer prompts with the features of their pictures; a batch that does not fit into the memory is halved."""
         import torch
 
-        features = [tensors for of_row in pictures for tensors in of_row]
+        all_features = [tensors for of_row in features for tensors in of_row]
         try:
-            return generate(self.student, rows, features, max_tokens=self.max_tokens, stop=self._stop)
+            return generate(self.student, rows, all_features, max_tokens=self.max_tokens, stop=self._stop)
         except torch.OutOfMemoryError as error:
             if len(rows) == 1:
                 where, fix = f"{STAGE}.max_pixels", "lower max_pixels or max_new_tokens, and choose another --out"
                 raise ConfigError("a sample exceeds the memory", where=where, got=str(error)[:120], fix=fix) from error
-        torch.cuda.empty_cache()  # here, because the exception holds what it refers to
+        torch.cuda.empty_cache()  # not in the handler, because the exception holds references to tensors
         half = len(rows) // 2
-        return self._decode(rows[:half], pictures[:half]) + self._decode(rows[half:], pictures[half:])
+        return self._decode(rows[:half], features[:half]) + self._decode(rows[half:], features[half:])
 
 
 class EngineAnswers:
@@ -187,25 +185,25 @@ class EngineAnswers:
         self.book = book
         self.trees = inputs.trees
         self.sampling = cfg.sampling
-        self.max_pixels = cfg.max_pixels or (inputs.taught_pixels if cfg.engine == "vllm" else 0)
-        self._most = cfg.endpoint.concurrency if cfg.engine == "endpoint" else cfg.vllm.batch
-        self._slots = asyncio.Semaphore(self._most)
+        self.max_pixels = cfg.max_pixels or (inputs.training_pixels if cfg.engine == "vllm" else 0)
+        self._most_in_flight = cfg.endpoint.concurrency if cfg.engine == "endpoint" else cfg.vllm.batch
+        self._slots = asyncio.Semaphore(self._most_in_flight)
         self._kept = KeptAnswers(engine, book)
         self._failed_in_row = 0
 
     async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[SampleOutcome, None]:
         """Yield the outcome of each sample, in their order; `advance` is called for each when it is there."""
         rest = iter(samples)
-        while part := list(islice(rest, WAITING * self._most)):
+        while part := list(islice(rest, WAITING * self._most_in_flight)):
             for outcome in await asyncio.gather(*(self._ask(sample, advance) for sample in part)):
                 yield outcome
 
     def _request(self, sample: Sample) -> Request:
-        """Return a sample as chat messages: its pictures as the student was taught to see them, then the question."""
-        # A set without pictures needs no tree.
-        folders = [inside(self.trees[sample.run], frame) for frame in sample.frames] if sample.views else []
-        pictures = [sample.pictures.read(folder) for folder in folders]
-        frames = [[picture_to_send(picture, self.max_pixels) for picture in views] for views in pictures]
+        """Return a sample as chat messages: its pictures as in the student's training, then the question."""
+        frames = []
+        for frame in sample.frames if sample.views else ():  # a set without pictures needs no tree
+            views = sample.pictures.read(inside(self.trees[sample.run], frame))
+            frames.append([picture_to_send(picture, self.max_pixels) for picture in views])
         schema = answer_schema(language=sample.language, place=decision_place(sample.answer))
         return student_request(sample.prompt, frames, schema, self.sampling)
 
@@ -218,7 +216,8 @@ class EngineAnswers:
             except InputError as error:
                 return SampleOutcome.failed(sample, error.code, error)
             except NoAnswer as error:
-                self._failed_in_row += not error.is_final  # otherwise the server answers, if only with a refusal
+                if not error.is_final:  # a final one is an answer of the server, a refusal
+                    self._failed_in_row += 1
                 if self._failed_in_row >= STOP_AFTER_FAILURES:
                     words = f"{self._failed_in_row} samples in a row got no answer"
                     fix = "fix the server, then run the same command again; answered samples are not asked again"
@@ -227,6 +226,6 @@ class EngineAnswers:
             finally:
                 advance(1)
         self._failed_in_row = 0
-        found = self.book.get(flight, answer_key(self.engine.model, request))
-        assert found is not None, "the answer was recorded"
-        return SampleOutcome(sample, found, is_new=not reply.is_kept)
+        answer = self.book.get(flight, answer_key(self.engine.model, request))
+        assert answer is not None, "the answer was recorded"
+        return SampleOutcome(sample, answer, is_new=not reply.is_kept)

@@ -1,4 +1,4 @@
-"""The samples of a split, the settings with which a student answers them, and what becomes of each."""
+"""Types of an inference: its settings, its inputs, and the outcome of a sample."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -55,22 +55,23 @@ class InferConfig(Config):
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a run reads. model: a folder, or the URL of a server."""
+    """What a run reads."""
 
     samples: Sequence[Sample]
-    trees: Mapping[str, Path]
-    model: str | Path
+    trees: Mapping[str, Path]  # run -> playback tree
+    model: str | Path  # a folder, or the URL of a server
     adapter: Path | None
 
     @property
-    def taught_pixels(self) -> int:
-        """Most pixels of a picture in training; 0: not known, as of a server or a base."""
+    def training_pixels(self) -> int:
+        """Most pixels of a picture in the student's training; 0 if not known, as of a server or a base model."""
         folder = self.adapter or Path(self.model)
         return read_chat_format(folder).max_pixels if (folder / CHAT_FORMAT_FILE).is_file() else 0
 
     @property
     def name(self) -> str:
-        """The model's name where it runs in this process: `model` of `train` and `merge` has that of its folder."""
+        """Name of a model that runs in this process: `run/student/model` is "student", with the adapter
+        `run/lora/adapter` it is "student+lora"."""
         folder = Path(self.model).absolute()
         name = folder.parent.name if folder.name == "model" else folder.name
         return name if self.adapter is None else f"{name}+{self.adapter.absolute().parent.name}"
@@ -78,11 +79,11 @@ class Inputs:
 
 @dataclass(frozen=True)
 class SampleOutcome:
-    """A sample with its answer, or with the reason why there is none. is_new: not recorded by an earlier run."""
+    """A sample with its answer, or with the reason why there is none."""
 
     sample: Sample
-    found: Answer | Failed
-    is_new: bool = False
+    result: Answer | Failed
+    is_new: bool = False  # not recorded by an earlier run
 
     @classmethod
     def failed(cls, sample: Sample, code: str, error: object) -> Self:
@@ -91,25 +92,23 @@ class SampleOutcome:
 
     def prediction(self, split: Split, model: str) -> Prediction:
         """Return the record of the sample."""
-        if isinstance(self.found, Failed):
-            record = make_prediction(self.sample, split, failure=self.found.code)
+        if isinstance(self.result, Failed):
+            record = make_prediction(self.sample, split, failure=self.result.code)
         else:
-            is_finished = self.found.finish_reason not in ("length", CONTEXT_FULL)
-            num_tokens = self.found.usage.get("completion_tokens", 0)
-            record = make_prediction(self.sample, split, self.found.text, num_tokens, is_finished)
+            is_finished = self.result.finish_reason not in ("length", CONTEXT_FULL)
+            num_tokens = self.result.usage.get("completion_tokens", 0)
+            record = make_prediction(self.sample, split, self.result.text, num_tokens, is_finished)
         return record.model_copy(update={"model": model})
 
 
 def make_prediction(
     sample: Sample, split: Split, text: str = "", num_tokens: int = 0, is_finished: bool = False, *, failure: str = ""
 ) -> Prediction:
-    """Parse an answer and return its record.
-
-    Args:
-        failure: Code of the reason why there is no answer; such a sample does not count as answered wrongly.
-    """
+    """Parse an answer and return its record. Without an answer, `failure` is the code of the reason; the sample is then
+    not counted as a wrong answer."""
     parsed = parse_answer(text, sample.language, finish_reason=None if is_finished else "length")
-    own = sample.model_dump(include={"sample_id", "language", "run", "window_id"})
-    answer = {"raw": text, "num_tokens": num_tokens, "is_finished": is_finished}
-    reason = f"{FAILED}{failure}" if failure else parsed.reason
-    return Prediction(**own, **answer, split=split, coc=parsed.coc, reason=reason, recovered=list(parsed.recovered))
+    return Prediction(
+        **sample.model_dump(include={"sample_id", "language", "run", "window_id"}), split=split, raw=text,
+        num_tokens=num_tokens, is_finished=is_finished, coc=parsed.coc,
+        reason=f"{FAILED}{failure}" if failure else parsed.reason, recovered=list(parsed.recovered),
+    )  # fmt: skip

@@ -56,13 +56,7 @@ def _with_model_name(cfg: InferConfig, url: str, out: Path) -> InferConfig:
 
 
 def run(
-    cfg: InferConfig,
-    dataset: Path,
-    data: Sequence[Path],
-    model: str | Path,
-    out: Path,
-    *,
-    adapter: Path | None = None,
+    cfg: InferConfig, dataset: Path, data: Sequence[Path], model: str | Path, out: Path, *, adapter: Path | None = None
 ) -> Path:
     """Read a split, its playback trees `data`, the model and (if given) its adapter; write `predictions.jsonl`.
 
@@ -110,7 +104,7 @@ def run(
     predictions = [outcome.prediction(cfg.split, name) for outcome in outcomes]
     lines = (dump_json(prediction.model_dump(mode="json")) + "\n" for prediction in predictions)
     write_bytes(out / PREDICTIONS, "".join(lines).encode())
-    failures = [outcome.found for outcome in outcomes if isinstance(outcome.found, Failed)]
+    failures = [outcome.result for outcome in outcomes if isinstance(outcome.result, Failed)]
     write_failures(out / "failures.jsonl", failures)
     failed = Counter(failure.code for failure in failures)
     tally = Tally(input=len(outcomes), kept=len(outcomes) - len(failures), failed=failed)

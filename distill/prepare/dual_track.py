@@ -172,15 +172,10 @@ def samples_of(place: Place, flight_id: str, pair: Pair, walk: str, cfg: DualTra
             vectors[f"{part}_rotation_deg"] = _vectors(track.rotations_deg[rows])
             vectors[f"{part}_target_m"] = _vectors(track.targets_m[rows])
         yield TrackSample(
-            sample_id=sample_id(flight_id, now - 1),
-            **asdict(place),
-            walk=walk,
-            window=tuple(range(first, now)),
-            future=tuple(range(now, end)),
-            time_s=tuple(time_s.tolist()),
-            states=tuple(perturbed.states[seen]),
+            sample_id=sample_id(flight_id, now - 1), **asdict(place), walk=walk, window=tuple(range(first, now)),
+            future=tuple(range(now, end)), time_s=tuple(time_s.tolist()), states=tuple(perturbed.states[seen]),
             **vectors,
-        )
+        )  # fmt: skip
 
 
 def _vectors(rows: np.ndarray) -> tuple[Any, ...]:

@@ -21,19 +21,21 @@ from distill.schema import Sample
 from distill.student.model import Student
 
 PICTURES_PER_BATCH = 16  # that are read, and then encoded together
-# Tensors of one picture by name. Before encoding: the inputs of the model. After it: those without PIXELS, such as
-# `image_grid_thw`, and the features: POOLED, (tokens, width) or as the family shapes it, and DEEP + "00", ..., for
-# deeper layers of the language model; names end with LISTED where the family returns a list, an entry per picture.
+# One picture as tensors by name. Before encoding, its inputs: those of the model, `pixel_...` and others such as
+# `image_grid_thw`. After encoding, its features: the inputs without pixels, and what the vision tower returned:
+#     pooled              (tokens, width), or as the family shapes it
+#     deep.00, deep.01    the same for deeper layers of the language model, if the family has them
+# Both names end with `[]` if the family returns a list with an entry for each picture instead of one tensor.
 Tensors = dict[str, Any]
 POOLED, DEEP, LISTED, PIXELS = "pooled", "deep.", "[]", "pixel_"
 
 
 class FramePicture(NamedTuple):
-    """One picture of a sample: a view of a frame of a run's playback tree, in the size and colors of the prompt."""
+    """One picture of a sample."""
 
-    run: str
-    frame: str
-    picture: Pictures
+    run: str  # of the playback tree
+    frame: str  # folder in the tree
+    view: Pictures  # which view of the frame, in the size and colours of the prompt
     is_alone: bool = False  # the only picture of its sample, which some families encode in more detail
 
 
@@ -53,14 +55,11 @@ class PictureReader:
     max_pixels: int = 0  # limit of a picture; 0: none
 
     def read(self, picture: FramePicture) -> Tensors:
-        """Read a picture as the inputs of the model.
-
-        Raises:
-            InputError: a file of the playback tree is missing, damaged, or of another size than the prompt says.
-        """
+        """Read the inputs of a picture; InputError if its file is missing, damaged, or of another size than the prompt
+        says."""
         import torch
 
-        (pixels,) = picture.picture.read(inside(self.trees[picture.run], picture.frame))
+        (pixels,) = picture.view.read(inside(self.trees[picture.run], picture.frame))
         arrays = self.student.picture_inputs(limited_picture(pixels, self.max_pixels), is_alone=picture.is_alone)
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
         return {name: t.to(self.student.dtype) if t.is_floating_point() else t for name, t in tensors.items()}
@@ -73,32 +72,29 @@ class PictureReader:
             return str(error)
 
 
-def encode(student: Student, pictures: Sequence[Tensors]) -> list[Tensors]:
-    """Encode pictures, those of equal shapes together; on a CPU one at a time, so that results never differ."""
+def encode(student: Student, inputs: Sequence[Tensors]) -> list[Tensors]:
+    """Return the features of pictures. Those of equal shapes are encoded together; on a CPU each one alone, so that the
+    results do not depend on the others."""
     groups: dict[Any, list[int]] = {}
-    for i, picture in enumerate(pictures):
+    for i, picture in enumerate(inputs):
         shapes = tuple((name, tuple(tensor.shape)) for name, tensor in picture.items())
         groups.setdefault(i if student.device == "cpu" else shapes, []).append(i)
     features: dict[int, Tensors] = {}
     for group in groups.values():
-        features |= zip(group, _encode_together(student, [pictures[i] for i in group]), strict=True)
-    return [features[i] for i in range(len(pictures))]
+        features |= zip(group, _encode_together(student, [inputs[i] for i in group]), strict=True)
+    return [features[i] for i in range(len(inputs))]
 
 
 def read_features(
-    student: Student,
-    pictures: Sequence[FramePicture],
-    results: Iterable[Tensors | str],
-    *,
-    is_frozen: bool = True,
-    most_bytes: float = math.inf,
-) -> dict[FramePicture, Tensors | str]:
-    """Encode pictures as they are read, and return their features, on the CPU, or the message of an error.
+    student: Student, pictures: Sequence[FramePicture], results: Iterable[Tensors | str], *,
+    is_frozen: bool = True, most_bytes: float = math.inf,
+) -> dict[FramePicture, Tensors | str]:  # fmt: skip
+    """Return the features of pictures, on the CPU, or the message of an error; they are encoded as they are read.
 
     Args:
         results: what `try_to_read` returns for each picture.
-        is_frozen: False keeps the inputs of a tower that is trained.
-        most_bytes: of the features; once they are more, the other pictures are read for their errors alone.
+        is_frozen: False returns the inputs, for a vision tower that is trained.
+        most_bytes: of the features; once they are more, the other pictures are only read for their errors.
     """
     import torch
 
@@ -107,12 +103,14 @@ def read_features(
     pairs = zip(pictures, results, strict=True)
     while batch := dict(islice(pairs, PICTURES_PER_BATCH)):
         features |= {picture: message for picture, message in batch.items() if isinstance(message, str)}
-        inputs = {picture: tensors for picture, tensors in batch.items() if not isinstance(tensors, str)}
         if num_bytes >= most_bytes:
             continue
-        with torch.no_grad():
-            encoded = encode(student, list(inputs.values())) if is_frozen else list(inputs.values())
-        for picture, tensors in zip(inputs, encoded, strict=True):
+        inputs = {picture: tensors for picture, tensors in batch.items() if not isinstance(tensors, str)}
+        new = list(inputs.values())
+        if is_frozen:
+            with torch.no_grad():
+                new = encode(student, new)
+        for picture, tensors in zip(inputs, new, strict=True):
             # A copy, because a tensor of a worker process holds a file open as long as it lives.
             features[picture] = {name: tensor.to("cpu", copy=True) for name, tensor in tensors.items()}
             num_bytes += sum(tensor.nbytes for tensor in tensors.values())
@@ -120,6 +118,7 @@ def read_features(
 
 
 def _encode_together(student: Student, pictures: Sequence[Tensors]) -> list[Tensors]:
+    """Return the features of pictures of equal shapes, given their inputs."""
     import torch
 
     if not hasattr(student.core.base_model, "get_image_features"):
@@ -133,41 +132,47 @@ def _encode_together(student: Student, pictures: Sequence[Tensors]) -> list[Tens
     outputs = {POOLED: output.pooler_output} | {f"{DEEP}{i:02d}": layer for i, layer in enumerate(layers)}
     features = [{name: t for name, t in tensors.items() if not name.startswith(PIXELS)} for tensors in pictures]
     for name, values in outputs.items():
-        is_listed = isinstance(values, list | tuple)
-        for tensors, value in zip(features, values if is_listed else values.chunk(len(pictures)), strict=True):
-            tensors[name + LISTED if is_listed else name] = value.to(student.dtype)
+        if isinstance(values, list | tuple):
+            stored_name, by_picture = name + LISTED, values
+        else:
+            stored_name, by_picture = name, values.chunk(len(pictures))
+        for tensors, value in zip(features, by_picture, strict=True):
+            tensors[stored_name] = value.to(student.dtype)
     return features
 
 
 @contextlib.contextmanager
-def with_encoded_pictures(student: Student, pictures: Sequence[Tensors]) -> Iterator[dict[str, Any]]:
-    """Replace the encoder in the model's own forward by features of pictures; yield the further inputs of forward."""
+def with_encoded_pictures(student: Student, features: Sequence[Tensors]) -> Iterator[dict[str, Any]]:
+    """Let the model's own forward use the features of pictures instead of encoding them; yield its further inputs.
+
+    That relies on three facts of transformers' families with pictures: forward calls the model's method
+    `get_image_features` if it gets `pixel_values`; it uses the pixels for nothing else; and an attribute of the
+    instance hides that method.
+    """
     import torch
 
-    if not pictures:
+    if not features:
         yield {}
         return
     dtype, device = student.core.get_input_embeddings().weight.dtype, student.device
 
     def joined(name: str) -> Any:
-        parts = [tensors[name].to(device, dtype) for tensors in pictures]
+        parts = [tensors[name].to(device, dtype) for tensors in features]
         return parts if name.endswith(LISTED) else torch.cat(parts)
 
-    (pooled,) = (name for name in pictures[0] if name.startswith(POOLED))
-    deep = sorted(name for name in pictures[0] if name.startswith(DEEP))  # in the order of the layers
+    (pooled,) = (name for name in features[0] if name.startswith(POOLED))
+    deep = sorted(name for name in features[0] if name.startswith(DEEP))  # in the order of the layers
     output = SimpleNamespace(pooler_output=joined(pooled), deepstack_features=[joined(name) for name in deep])
-    names = pictures[0].keys() - {pooled, *deep}
-    inputs = {name: torch.cat([tensors[name] for tensors in pictures]).to(device) for name in names}
+    further_names = features[0].keys() - {pooled, *deep}
+    further = {name: torch.cat([tensors[name] for tensors in features]).to(device) for name in further_names}
     model = student.core.base_model
 
     @functools.wraps(model.get_image_features)  # `generate` reads its signature
-    def encoded(*_: Any, **__: Any) -> Any:
+    def known_features(*_: Any, **__: Any) -> Any:
         return output
 
-    # An attribute of the instance hides the method of its class.
-    model.__dict__["get_image_features"] = encoded
+    model.__dict__["get_image_features"] = known_features
     try:
-        # Forward asks for the features only if it is given pixels, whose values are not used then.
-        yield {"pixel_values": torch.zeros(1, dtype=dtype, device=device), **inputs}
+        yield {"pixel_values": torch.zeros(1, dtype=dtype, device=device), **further}
     finally:
         del model.__dict__["get_image_features"]

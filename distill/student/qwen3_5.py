@@ -15,11 +15,12 @@ LINEAR_ATTENTION = "fla"
 
 
 def choose_kernels(dtype: Any, device: str) -> None:
-    """Decide which kernels transformers finds when it first loads the model's code; call this before.
+    """Decide which kernels transformers finds on an accelerator. Call this before it first loads the model's code.
 
-    In float32 on an accelerator PyTorch's own functions are used, because the fast kernels of linear attention round to
-    fewer digits or refuse it. Otherwise, where causal-conv1d is not installed, because it has to be compiled, the short
-    convolution of flash-linear-attention takes its place.
+    - In float32 it uses PyTorch's own functions, because the fast kernels of linear attention round to fewer digits or
+      do not support float32.
+    - Otherwise it uses the fast kernels that are installed. If only causal-conv1d is missing, which has to be compiled,
+      the short convolution of flash-linear-attention replaces it.
     """
     import torch
 
@@ -30,7 +31,8 @@ def choose_kernels(dtype: Any, device: str) -> None:
         log.warning(words, " and ".join(missing))
     if dtype == torch.float32:
         for package in (LINEAR_ATTENTION, CONVOLUTION):
-            sys.modules.setdefault(package, None)  # type: ignore[arg-type]  # so that its import fails
+            # None makes an import fail; a package that is already imported stays.
+            sys.modules.setdefault(package, None)  # type: ignore[arg-type]
     elif missing == [CONVOLUTION]:
         module = types.ModuleType(CONVOLUTION)
         module.__spec__ = ModuleSpec(CONVOLUTION, None)
@@ -42,28 +44,30 @@ def _convolution(x: Any, weight: Any, bias: Any = None, activation: str | None =
     """Convolve along time, as causal-conv1d's function: x (b, d, t), weight (d, width) -> (b, d, t)."""
     from fla.modules.causal_conv1d import causal_conv1d
 
-    found, _ = causal_conv1d(x.transpose(1, 2).contiguous(), weight, bias, activation=activation)
-    return found.transpose(1, 2)
+    convolved, _ = causal_conv1d(x.transpose(1, 2).contiguous(), weight, bias, activation=activation)
+    return convolved.transpose(1, 2)
 
 
 # --- norms ------------------------------------------------------------------------------------------------------------
 
 
 def fuse_norms(model: Any) -> None:
-    """Compute each norm of a language model by one kernel, which keeps its input and a number a row for its gradient.
+    """Compute each norm of a language model by one kernel, which stores its input and one number per row for the
+    backward pass.
 
-    The library computes them step by step in float32 and keeps what each step read. In float32 the numbers are the
+    The library computes them step by step in float32 and stores the input of each step. In float32 the results are the
     same; in bfloat16 the normed values are rounded once more before they are scaled.
     """
     fused = _fused_norms()
     for module in model.modules():
         if type(module) in fused:
-            module.__class__ = fused[type(module)]
+            module.__class__ = fused[type(module)]  # it has the same attributes; only `forward` differs
 
 
 @cache
 def _fused_norms() -> dict[type, type]:
-    """Return the library's classes of norms, and those that take their place."""
+    """Return the library's classes of norms -> those that replace them. As in the library, the plain norm scales by
+    1 + weight, the gated one by its weight."""
     import torch
     from transformers.models.qwen3_5.modeling_qwen3_5 import Qwen3_5RMSNorm, Qwen3_5RMSNormGated
 

@@ -234,16 +234,13 @@ def run(
                 write_student(context.student, partial, base, base_name)
                 write_chat_format(partial, taught)
             folder.finish(
-                [out / LOG, *sorted(product.iterdir())],
-                tally,
-                steps=progress.step,
-                best_step=progress.best_step,
+                [out / LOG, *sorted(product.iterdir())], tally, steps=progress.step, best_step=progress.best_step,
                 tokens=int(context.train.lengths.sum()),
                 parameters=sum(p.numel() for p in context.student.model.parameters()),
                 trainable_parameters=sum(p.numel() for p in learning_weights(context.student).values()),
                 device=context.student.device,
                 versions={name: metadata.version(name) for name in ("torch", "transformers", "peft")},
-            )
+            )  # fmt: skip
     return product
 
 

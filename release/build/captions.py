@@ -1,4 +1,4 @@
-"""Which captions are released: the accepted ones, by track, and an account of all. Only their places are in memory."""
+"""The captions of the tracks of a release, and an account of all captions. Memory holds only where they are stored."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -18,13 +18,13 @@ NO_REASON = "no reason given"
 
 @dataclass
 class TrackCaptions:
-    """The captions of a track, by frame. spans: First byte and size of the accepted ones in the file. dropped: Why the
-    others were dropped. before, after: The greatest number of frames that a caption needs before and after its own."""
+    """The captions of a track, by frame."""
 
     path: Path
-    num_frames: int
-    spans: dict[int, tuple[int, int]] = field(default_factory=dict)
-    dropped: dict[int, str] = field(default_factory=dict)
+    num_frames: int  # of the track
+    spans: dict[int, tuple[int, int]] = field(default_factory=dict)  # of accepted ones: first byte and size in the file
+    dropped: dict[int, str] = field(default_factory=dict)  # of the others: why they were dropped
+    # Most frames that a caption needs before and after its own: nearer to an end of the track is no whole window.
     before: int = 0
     after: int = 0
 
@@ -64,7 +64,7 @@ class CaptionAccount:
 
     dropped: Counter[str] = field(default_factory=Counter)  # reason -> captions
     accepted: int = 0
-    of_no_flight: int = 0  # accepted, of tracks that are not released
+    of_other_tracks: int = 0  # accepted ones of tracks that are not released
     window_frames: int = 1  # the longest window, from its first frame to its last
     teachers: Counter[tuple[str, str, str]] = field(default_factory=Counter)  # kind, model, settings as JSON
     tokens: Counter[str] = field(default_factory=Counter)
@@ -84,13 +84,12 @@ class CaptionAccount:
 
 
 def index_captions(
-    path: Path, released: Mapping[FlightKey, TrackCaptions], others: set[FlightKey], account: CaptionAccount
+    path: Path, released: Mapping[FlightKey, TrackCaptions], not_released: set[FlightKey], account: CaptionAccount
 ) -> None:
-    """Read the captions of a tree once and note where those of each track are stored.
+    """Read the captions of a tree once; add those of released tracks to these, and all to the account.
 
     Args:
-        released: The released tracks, whose captions are added. others: The tracks of the tree that are not released.
-        account: Each caption is added.
+        not_released: The other tracks of the tree.
 
     Raises:
         InputError: A caption is of another tree, lacks a language, or repeats a frame.
@@ -98,15 +97,15 @@ def index_captions(
     for span, caption in caption_spans(path):
         key = (caption.town, caption.trajectory, caption.variant)
         try:
-            _check(caption, is_known=key in released or key in others)
+            _check(caption, is_known=key in released or key in not_released)
             if key in released:
                 released[key].add(caption, span)
         except InputError as error:
             error.where = f"{path}: {caption.sample_id}"
             raise
-        account.add(caption)
-        if key in others and caption.status == "accepted":
-            account.of_no_flight += 1
+        account.add(caption)  # after its checks
+        if key in not_released and caption.status == "accepted":
+            account.of_other_tracks += 1
 
 
 def _check(caption: Caption, *, is_known: bool) -> None:

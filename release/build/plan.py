@@ -1,4 +1,4 @@
-"""Which tracks are released and which shard holds them: decided before any is written, so that neither the number of
+"""Choose the tracks of a release, their frames, splits and shards: before any is written, so that neither the number of
 workers nor a kill changes it."""
 
 import hashlib
@@ -29,14 +29,14 @@ NO_TWIN = "its other track is not released"  # why a track is dropped
 
 @dataclass(frozen=True)
 class Chosen:
-    """A track that is released. size_px: Width, height. selected: Its released frames; num_bytes: Of their files."""
+    """A track that is released."""
 
     candidate: Candidate
     track: TrackName
-    size_px: tuple[int, int]
+    size_px: tuple[int, int]  # width, height
     captions: TrackCaptions
-    selected: tuple[int, ...] = ()
-    num_bytes: int = 0
+    selected: tuple[int, ...] = ()  # its released frames
+    num_bytes: int = 0  # of the files of these
     placement: Placement = UNPLACED
 
     @property
@@ -59,9 +59,9 @@ class Chosen:
 
 @dataclass(frozen=True)
 class PlannedShard:
-    """A shard to write. name: Of its part, the same for the same tracks of the same sizes."""
+    """A shard to write."""
 
-    name: str
+    name: str  # of its file while the release is being built, the same for the same tracks of the same sizes
     split: SplitName
     tracks: list[Chosen]
 
@@ -95,7 +95,7 @@ def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> 
         raise _no_track(sources, material, dropped, stage)
     tracks = place_tracks([_with_size(track, cfg, account.window_frames) for track in tracks], walks, cfg)
     maps = maps_of([track.candidate for track in tracks])
-    licence = choose_licence(cfg.licence, [(one.town, one.licence) for one in maps])
+    licence = choose_licence(cfg.licence, [(town_map.town, town_map.licence) for town_map in maps])
     return ReleasePlan(tracks, shards_of(tracks, cfg.shard_bytes), account, material, dropped, maps, licence)
 
 
@@ -107,30 +107,33 @@ def survey_tracks(
 ) -> tuple[list[Chosen], dict[str, str], Counter[str]]:
     """Read the tracks that no inspection drops.
 
+    Args:
+        tracks: The kinds of track to release.
+
     Returns:
-        Those of the wanted kinds; trajectory -> walk; why others are dropped.
+        The tracks of these kinds; trajectory -> walk; why others are dropped.
     """
-    found: list[Chosen] = []
-    dropped = Counter(one.dropped for one in candidates if one.dropped is not None)
-    wanted = [one for one in candidates if one.dropped is None]
+    chosen: list[Chosen] = []
+    dropped = Counter(candidate.dropped for candidate in candidates if candidate.dropped is not None)
+    remaining = [candidate for candidate in candidates if candidate.dropped is None]
 
     def courses() -> Iterator[Course]:
-        with progress_bar("release: tracks read", total=len(wanted)) as advance:
-            for one in wanted:
+        """Yield the pedestrian's course of each track, and note in passing whether the track is chosen."""
+        with progress_bar("release: tracks read", total=len(remaining)) as advance:
+            for candidate in remaining:
                 advance(1)
-                track = open_track(one)
+                track = open_track(candidate)
                 kind: TrackName = "clean" if track.is_original else "perturbed"
                 if kind not in tracks:
                     dropped[f"track {kind} not wanted"] += 1
                     continue
-                captions = TrackCaptions(sources[one.source].captions, len(track))
-                found.append(Chosen(one, kind, (track.camera.width_px, track.camera.height_px), captions))
-                yield Course(
-                    one.trajectory, one.place.town, track.time_s, track.targets_m - track.perturbation.target_m
-                )
+                captions = TrackCaptions(sources[candidate.source].captions, len(track))
+                chosen.append(Chosen(candidate, kind, (track.camera.width_px, track.camera.height_px), captions))
+                positions_m = track.targets_m - track.perturbation.target_m
+                yield Course(candidate.trajectory, candidate.place.town, track.time_s, positions_m)
 
     walks = walks_of(courses())
-    return found, walks, dropped
+    return chosen, walks, dropped
 
 
 def open_track(candidate: Candidate) -> Track:
@@ -143,28 +146,23 @@ def open_track(candidate: Candidate) -> Track:
 
 
 def keep_pairs(tracks: list[Chosen], cfg: ReleaseConfig) -> tuple[list[Chosen], Counter[str]]:
-    """Drop tracks whose other track is not released, unless `pairs` is `any` or one kind of track is wanted.
-
-    Args:
-        tracks: Those that every other filter keeps.
-    Returns:
-        The others, and the number of dropped ones.
-    """
+    """Drop tracks whose other track is not released, unless `pairs` is `any` or only one kind of track is released;
+    return the others, and why how many are dropped."""
     groups = defaultdict[str, list[Chosen]](list)
     for track in tracks:
         groups[track.trajectory].append(track)
     for group in groups.values():
-        kinds, lengths = {one.track for one in group}, {one.num_frames for one in group}
+        kinds, lengths = {track.track for track in group}, {track.num_frames for track in group}
         if len(kinds) < len(group) or len(lengths) > 1:
             raise InputError(
                 "the tracks of a trajectory are not a pair", where=group[0].candidate.folder.parent,
-                got=", ".join(f"{one.track} {one.num_frames} frames" for one in group),
+                got=", ".join(f"{track.track} {track.num_frames} frames" for track in group),
                 expected="one clean and one perturbed track of the same length",
             )  # fmt: skip
     if cfg.pairs == "any" or len(cfg.tracks) < 2:
         return tracks, Counter()
     kept = [track for track in tracks if len(groups[track.trajectory]) == 2]
-    return kept, +Counter({NO_TWIN: len(tracks) - len(kept)})
+    return kept, +Counter({NO_TWIN: len(tracks) - len(kept)})  # +: without a count of 0
 
 
 def _check_sizes(tracks: list[Chosen]) -> None:
@@ -183,13 +181,16 @@ def _index_captions(sources: list[Source], material: Material, tracks: list[Chos
     total = CaptionAccount()
     for number, source in enumerate(sources):
         released = dict[FlightKey, TrackCaptions]()
-        for track in (track for track in tracks if track.candidate.source == number):
-            if track.candidate.key in released:
+        for track in tracks:
+            key = track.candidate.key
+            if track.candidate.source != number:
+                continue
+            if key in released:
                 what, fix = "the track occurs in several runs below this directory", "build a release of each run"
-                raise InputError(what, where=source.captions, got="/".join(track.candidate.key), fix=fix)
-            released[track.candidate.key] = track.captions
-        others = {one.key for one in material.candidates if one.source == number} - released.keys()
-        index_captions(source.captions, released, others, total)
+                raise InputError(what, where=source.captions, got="/".join(key), fix=fix)
+            released[key] = track.captions
+        not_released = {one.key for one in material.candidates if one.source == number} - released.keys()
+        index_captions(source.captions, released, not_released, total)
     return total
 
 
@@ -217,7 +218,7 @@ def _no_track(sources: list[Source], material: Material, dropped: Counter[str], 
 
 def _with_size(track: Chosen, cfg: ReleaseConfig, window_frames: int) -> Chosen:
     """Return a track with its selected frames and the bytes of their files, depth unpacked."""
-    total = 0
+    num_bytes = 0
     selected = tuple(select_frames(track.num_frames, cfg.num_frames, cfg.selection, window_frames).tolist())
     for i in selected:
         for file in cfg.modalities:
@@ -226,8 +227,8 @@ def _with_size(track: Chosen, cfg: ReleaseConfig, window_frames: int) -> Chosen:
             if not size:
                 fix = "render the track again, or reject it in the review"
                 raise InputError("a file of the frame is missing or empty", where=path, fix=fix)
-            total += 4 * math.prod(track.size_px) if path.name == DEPTH_PNG else size
-    return replace(track, selected=selected, num_bytes=total)
+            num_bytes += 4 * math.prod(track.size_px) if path.name == DEPTH_PNG else size  # it is stored as float32
+    return replace(track, selected=selected, num_bytes=num_bytes)
 
 
 def place_tracks(tracks: list[Chosen], walks: dict[str, str], cfg: ReleaseConfig) -> list[Chosen]:
@@ -237,11 +238,12 @@ def place_tracks(tracks: list[Chosen], walks: dict[str, str], cfg: ReleaseConfig
     groups = defaultdict[str, list[str]](list)
     for track in tracks:
         groups[track.trajectory].append(track.name)
-    pairs = {name: next((other for other in own if other != name), None) for own in groups.values() for name in own}
-    return [
-        replace(one, placement=Placement(walk=walks[one.trajectory], split=splits[one.name], pair=pairs[one.name]))
-        for one in tracks
-    ]
+    placed = []
+    for track in tracks:
+        pair = next((name for name in groups[track.trajectory] if name != track.name), None)
+        placement = Placement(walk=walks[track.trajectory], split=splits[track.name], pair=pair)
+        placed.append(replace(track, placement=placement))
+    return placed
 
 
 def shards_of(tracks: list[Chosen], target_bytes: int) -> list[PlannedShard]:
@@ -253,11 +255,11 @@ def shards_of(tracks: list[Chosen], target_bytes: int) -> list[PlannedShard]:
         for track in tracks:
             if track.placement.split == split:
                 trajectories[track.trajectory].append(track)
-        own = list(trajectories.values())
-        sizes = [sum(track.num_bytes for track in group) for group in own]
+        groups = list(trajectories.values())
+        sizes = [sum(track.num_bytes for track in group) for group in groups]
         for number, indices in enumerate(group_by_size(sizes, target_bytes)):
-            members = [track for index in indices for track in own[index]]
-            parts = (f"{one.name} {one.placement} {len(one.selected)} {one.num_bytes}\n" for one in members)
-            digest = hashlib.sha256("".join(parts).encode()).hexdigest()[:12]
+            members = [track for index in indices for track in groups[index]]
+            lines = [f"{track.name} {track.placement} {len(track.selected)} {track.num_bytes}\n" for track in members]
+            digest = hashlib.sha256("".join(lines).encode()).hexdigest()[:12]
             shards.append(PlannedShard(f"{split}-{number:05d}-{digest}", split, members))
     return shards

@@ -36,7 +36,7 @@ from release.columns import PICTURES, caption_values
 from release.record import StoredFile
 
 # Values between two looks at the size of a page: with more a page takes a whole row group, twice in memory.
-VALUES_A_BATCH = 4
+VALUES_PER_BATCH = 4
 MOST_ROWS = 1000  # of a row group: of small pictures it would hold more rows than memory should
 RENDER = "render the track again, or restore the file"
 RESTORE = "restore the file, or inspect and caption the changed tree"
@@ -57,22 +57,22 @@ def write_shard(
     Raises:
         InputError, VerifyError: Names the first file that cannot be released.
     """
-    of_points, schema = points_part(path), columns.points_schema()
+    points_path, schema = points_part(path), columns.points_schema()
     with (
-        atomic_file(of_points) as points_file,
+        atomic_file(points_path) as points_file,
         atomic_file(path) as file,
         pq.ParquetWriter(points_file, schema, compression="zstd", version="2.6", write_page_index=True) as points,
         open_writer(file, columns.schema(files)) as writer,
     ):
-        rows = _Rows(writer, row_group_bytes)
+        frames = _RowGroups(writer, row_group_bytes)
         for chosen in tracks:
             track = open_track(chosen.candidate)
-            _write_track(chosen, track, files, rows)
-            of_track = [columns.point_row(track, i, chosen.placement) for i in range(len(track))]
-            points.write_table(pa.Table.from_pylist(of_track, schema=schema))
-        rows.flush()
-    frames = _stored(path, sum(len(chosen.selected) for chosen in tracks))
-    return ShardResult(frames=frames, points=_stored(of_points, sum(chosen.num_frames for chosen in tracks)))
+            _write_frames(chosen, track, files, frames)
+            rows = [columns.point_row(track, i, chosen.placement) for i in range(len(track))]
+            points.write_table(pa.Table.from_pylist(rows, schema=schema))
+        frames.flush()
+    num_frames, num_points = sum(len(track.selected) for track in tracks), sum(track.num_frames for track in tracks)
+    return ShardResult(frames=_stored(path, num_frames), points=_stored(points_path, num_points))
 
 
 def points_part(path: Path) -> Path:
@@ -87,11 +87,12 @@ def _stored(path: Path, rows: int) -> StoredFile:
 # --- rows -------------------------------------------------------------------------------------------------------------
 
 
-class _Rows:
-    """Rows on their way into row groups of a size that viewers load one at a time."""
+class _RowGroups:
+    """Collects rows into row groups of a size that viewers load one at a time, and writes them."""
 
     def __init__(self, writer: pq.ParquetWriter, row_group_bytes: int) -> None:
-        self._writer, self._most_bytes = writer, row_group_bytes
+        self._writer = writer
+        self._most_bytes = row_group_bytes
         self._rows: list[dict[str, Any]] = []
         self._num_bytes = 0
 
@@ -116,10 +117,13 @@ def open_writer(sink: str | IO[bytes], schema: pa.Schema) -> pq.ParquetWriter:
     only repeat their first bytes. The page index lets the hub's viewer read one row without its row group.
     """
     leaves: list[str] = []  # parquet's paths of the primitive columns
-    for member in schema:
-        inner = [child.name for child in member.type] if pa.types.is_struct(member.type) else []
-        inner = ["list.element"] if pa.types.is_list(member.type) else inner
-        leaves += [f"{member.name}.{name}" for name in inner] or [member.name]
+    for field in schema:
+        if pa.types.is_struct(field.type):
+            leaves += [f"{field.name}.{member.name}" for member in field.type]
+        elif pa.types.is_list(field.type):
+            leaves.append(f"{field.name}.list.element")
+        else:
+            leaves.append(field.name)
     compression = {name: "none" if name.endswith(".bytes") else "zstd" for name in leaves}
     small = [name for name in leaves if name != PICTURES["depth"].name and not name.endswith(".bytes")]
     repeated = [name for name in small if name in schema.names and schema.field(name).type == pa.string()]
@@ -131,11 +135,12 @@ def open_writer(sink: str | IO[bytes], schema: pa.Schema) -> pq.ParquetWriter:
         write_statistics=small,
         version="2.6",
         write_page_index=True,
-        write_batch_size=VALUES_A_BATCH,
+        write_batch_size=VALUES_PER_BATCH,
     )
 
 
-def _write_track(chosen: Chosen, track: Track, files: Collection[FrameFile], rows: _Rows) -> None:
+def _write_frames(chosen: Chosen, track: Track, files: Collection[FrameFile], frames: _RowGroups) -> None:
+    """Write the rows of the selected frames of a track, with their checked pictures and captions."""
     folder = chosen.candidate.folder
     digests = _digests(chosen.candidate)
     tree = tree_of(track.frame_folder(0))
@@ -145,11 +150,12 @@ def _write_track(chosen: Chosen, track: Track, files: Collection[FrameFile], row
         if frame.is_symlink():
             check_stays_below(frame, tree)
         caption = caption_values(chosen.captions.read(i)) if i in chosen.captions.spans else None
-        row, num_bytes = columns.scalar_row(track, i, caption, chosen.placement), 0
+        row = columns.scalar_row(track, i, caption, chosen.placement)
+        num_bytes = 0
         for file in files:
             path = frame_path(frame, FILE_NAMES[file])
-            inside = tree if path.is_symlink() else None  # its folder was looked at
-            data = read_bytes(path, what="file of the frame", fix="render the track again", tree=inside)
+            allowed_in = tree if path.is_symlink() else None  # its folder was checked above
+            data = read_bytes(path, what="file of the frame", fix="render the track again", tree=allowed_in)
             size_px = (track.camera.width_px, track.camera.height_px)
             _check_picture(file, data, size_px, path, is_inspected=chosen.candidate.sha256 is not None)
             _check_digest(folder, f"{frame_name(i)}/{path.name}", data, digests)
@@ -158,7 +164,7 @@ def _write_track(chosen: Chosen, track: Track, files: Collection[FrameFile], row
             else:
                 row[PICTURES[file].name] = {"bytes": data, "path": f"{row['sample_id']}_{FILE_NAMES[file]}"}
             num_bytes += len(data)
-        rows.add(row, num_bytes)
+        frames.add(row, num_bytes)
         advance()
 
 
@@ -184,9 +190,8 @@ def _check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where
 
 
 def _digests(candidate: Candidate) -> dict[str, str]:
-    """Return the sha256 of each file of a track, as far as they are known, once it is clear that they are those that
-    were inspected.
-    """
+    """Return the sha256 of each file of a track, if they are recorded; VerifyError if the track has changed since its
+    inspection."""
     folder = candidate.folder
     if candidate.sha256 is None:
         digests = read_checksums(folder) if (folder / CHECKSUMS).is_file() else {}

@@ -1,8 +1,9 @@
-"""What goes into a release: the runs it is made of, their tracks, maps and licence, and what each track is called."""
+"""The sources of a release: the runs it is made of, their tracks with their names, their maps and the licence."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,8 +17,8 @@ from cosfly.runtime.io import check_stays_below, inside
 from release.build.captions import FlightKey
 from release.record import ReleasedMap
 
-IN_REVIEW = "review: "  # how the reason begins why a track is dropped that waits for a person
-NOT_CHOSEN = "not chosen"  # why a track is dropped that `release.flights` does not name
+IN_REVIEW = "review: "  # begin of the reason to drop a track that waits for a person's decision
+NOT_CHOSEN = "not chosen"  # the reason to drop a track that `release.flights` does not name
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Source:
 
     @classmethod
     def of_run(cls, folder: Path) -> Source:
-        """Take a run folder as `cosfly run` makes it."""
+        """Return the source of a run directory, the output of `cosfly run`."""
         if not (folder / "render").is_dir():
             raise InputError(
                 "the folder is not a run directory", where=folder,
@@ -55,37 +56,39 @@ class Source:
 
     @classmethod
     def of_files(cls, data: Path, captions: Path, inspect: Path | None = None) -> Source:
-        """Name a run by the folder that contains its tree."""
+        """Return the source of these files; the run has the name of the folder that contains its tree."""
         return cls(folder_name(data.absolute().parent.name), data, captions, inspect)
 
 
-def told_apart(sources: list[Source]) -> list[Source]:
-    """Add to runs that share a name that of the tree, as for two trees in one folder, or of the folder above, as for
-    towns of two runs: rows and records know a run by its name alone."""
-    counts = Counter(source.run for source in sources)
-    named = [
-        replace(one, run=folder_name(f"{one.run}_{one.data.absolute().name}")) if counts[one.run] > 1 else one
-        for one in sources
-    ]
-    counts = Counter(source.run for source in named)
-    named = [
-        replace(one, run=folder_name(f"{one.data.absolute().parents[1].name}_{given.run}"))
-        if counts[one.run] > 1
-        else one
-        for given, one in zip(sources, named, strict=True)
-    ]
-    name, count = Counter(source.run for source in named).most_common(1)[0]
+def with_unique_names(sources: list[Source]) -> list[Source]:
+    """Return the sources with different names, because rows and records know a run by its name alone.
+
+    Two trees in one folder get the names of the trees too (`run_render`); two trees of equal names in folders of equal
+    names get the name of the folder above (`above_run`).
+    """
+    own_names = [source.run for source in sources]
+    names = list(own_names)
+    for with_more in (
+        lambda data, run: f"{run}_{data.name}",
+        lambda data, run: f"{data.parents[1].name}_{run}",
+    ):
+        counts = Counter(names)
+        names = [
+            folder_name(with_more(source.data.absolute(), run)) if counts[name] > 1 else name
+            for source, run, name in zip(sources, own_names, names, strict=True)
+        ]
+    name, count = Counter(names).most_common(1)[0]
     if count > 1:
         raise InputError(
             "several runs have the same name", got=f"{count} runs with the name {name}",
             expected="trees with different names, or in folders with different names",
             fix="rename one of the trees, or the folder that contains it",
         )  # fmt: skip
-    return named
+    return [replace(source, run=name) for source, name in zip(sources, names, strict=True)]
 
 
 def input_names(sources: list[Source]) -> list[dict[str, str]]:
-    """Return of each source role -> name among the stage's inputs: of several with a number in front."""
+    """Return for each source role -> name among the stage's inputs, with a number in front if there are several."""
     return [
         {role: f"{number}.{role}" if len(sources) > 1 else role for role in source.files}
         for number, source in enumerate(sources, 1)
@@ -94,19 +97,15 @@ def input_names(sources: list[Source]) -> list[dict[str, str]]:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A track that a source has: where it is stored and what it is called.
+    """A track of a source."""
 
-    source: Its number. dropped: Why it is not released, `result: reason` of the inspection, else None. sha256: Of its
-    files as they were inspected; five_ray_mean: As it was inspected; None without an inspection.
-    """
-
-    source: int
+    source: int  # number of the source
     place: Place
     folder: Path
-    flight_id: str = ""
-    dropped: str | None = None
-    sha256: str | None = None
-    five_ray_mean: float | None = None
+    flight_id: str = ""  # with which its sample ids begin
+    dropped: str | None = None  # why it is not released, as `result: reason` of the inspection; None if it may be
+    sha256: str | None = None  # of its files as they were inspected, None without an inspection
+    five_ray_mean: float | None = None  # as it was inspected
 
     @property
     def name(self) -> str:
@@ -126,43 +125,55 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Material:
-    """All tracks of the sources, and the funnel of their inspections. num_inspected: Of the tracks."""
+    """All tracks of the sources."""
 
     candidates: list[Candidate]
-    num_inspected: int
-    trajectories: TrajectoryFunnel | None
+    num_inspected: int  # those of sources with an inspection
+    trajectories: TrajectoryFunnel | None  # the sum of the inspections
 
 
 def gather(sources: list[Source], *, include_review: bool, choice: TrackChoice = ALL_TRACKS) -> Material:
     """List the tracks of the runs with the results of their inspections; those that are not chosen are dropped."""
-    wanted = ("accepted", "review") if include_review else ("accepted",)
-    found: list[Candidate] = []
+    results = ("accepted", "review") if include_review else ("accepted",)
+    candidates: list[Candidate] = []
     inspections: list[Inspection] = []
     for number, source in enumerate(sources):
         if source.inspect is None:
             for folder in find_tracks(source.data):
                 inner = folder.relative_to(source.data)
                 dropped = None if choice.names(inner.as_posix()) else NOT_CHOSEN
-                found.append(Candidate(number, _place(source, inner), folder, dropped=dropped))
-            continue
-        inspections.append(read_settled(source.inspect))
-        for one in inspections[-1].flights:
-            dropped = None if one.result in wanted else f"{one.result}: {one.reason}"
-            if not choice.names(one.folder):
-                dropped = NOT_CHOSEN
-            folder, five_ray = inside(source.data, one.folder, in_parent=True), one.metrics.get("five_ray_mean")
-            place = _place(source, Path(one.folder))
-            if Path(one.folder).parts[-2:] not in ((one.trajectory, one.variant), (one.variant,)):
-                raise InputError(
-                    "the record of a track has the folder of another track", where=source.inspect, got=one.folder,
-                    expected=f"a folder that ends in {one.trajectory}/{one.variant}", fix="run cosfly inspect again",
-                )  # fmt: skip
-            found.append(Candidate(number, place, folder, "", dropped, one.sha256, five_ray))
-    # Dropped tracks make no name longer: `release verify` knows the released ones alone.
-    ids = flight_ids([one.place for one in found])
-    ids |= flight_ids([one.place for one in found if one.dropped is None])
-    candidates = [replace(one, flight_id=ids[one.place]) for one in found]
-    return Material(candidates, sum(len(one.flights) for one in inspections), _funnel_of(inspections))
+                candidates.append(Candidate(number, _place(source, inner), folder, dropped=dropped))
+        else:
+            inspection = read_settled(source.inspect)
+            inspections.append(inspection)
+            candidates += _inspected(number, source, inspection, results, choice)
+    # Dropped tracks make no id longer: `release verify` knows only the released ones.
+    ids = flight_ids([candidate.place for candidate in candidates])
+    ids |= flight_ids([candidate.place for candidate in candidates if candidate.dropped is None])
+    candidates = [replace(candidate, flight_id=ids[candidate.place]) for candidate in candidates]
+    num_inspected = sum(len(inspection.flights) for inspection in inspections)
+    return Material(candidates, num_inspected, _funnel_of(inspections))
+
+
+def _inspected(
+    number: int, source: Source, inspection: Inspection, results: Collection[str], choice: TrackChoice
+) -> Iterator[Candidate]:
+    """Yield the tracks of an inspection; those with other results than `results` and those not chosen are dropped."""
+    for track in inspection.flights:
+        dropped = None if track.result in results else f"{track.result}: {track.reason}"
+        if not choice.names(track.folder):
+            dropped = NOT_CHOSEN
+        inner = Path(track.folder)
+        if inner.parts[-2:] not in ((track.trajectory, track.variant), (track.variant,)):
+            raise InputError(
+                "the record of a track has the folder of another track", where=source.inspect, got=track.folder,
+                expected=f"a folder that ends in {track.trajectory}/{track.variant}", fix="run cosfly inspect again",
+            )  # fmt: skip
+        folder = inside(source.data, track.folder, in_parent=True)
+        yield Candidate(
+            number, _place(source, inner), folder, dropped=dropped, sha256=track.sha256,
+            five_ray_mean=track.metrics.get("five_ray_mean"),
+        )  # fmt: skip
 
 
 def _funnel_of(inspections: list[Inspection]) -> TrajectoryFunnel | None:
@@ -175,10 +186,10 @@ def _funnel_of(inspections: list[Inspection]) -> TrajectoryFunnel | None:
 
 
 def maps_of(candidates: list[Candidate]) -> list[ReleasedMap]:
-    """Return the maps that tracks show, each once."""
+    """Return the maps of the towns of tracks, each once."""
     towns = {(track.place.town, track.folder.parent.parent) for track in candidates}
-    shown = {ReleasedMap(town=town, **dict(read_town_map(folder))) for town, folder in towns}
-    return sorted(shown, key=lambda one: (one.town, one.name, one.licence, one.credits))
+    maps = {ReleasedMap(town=town, **dict(read_town_map(folder))) for town, folder in towns}
+    return sorted(maps, key=lambda town_map: (town_map.town, town_map.name, town_map.licence, town_map.credits))
 
 
 def _place(source: Source, folder: Path) -> Place:
@@ -189,14 +200,13 @@ def _place(source: Source, folder: Path) -> Place:
 
 
 def choose_licence(licence: str | None, maps: list[tuple[str, str]]) -> str:
-    """Return the licence of the data set: `licence` where it is given, else that of the maps, of each its name and
-    licence.
-    """
-    chosen = licence or maps[0][1]
-    if chosen == UNKNOWN_LICENCE or (licence is None and len({one for _, one in maps}) > 1):
+    """Return the licence of the data set: the given one, or else that of all its maps, given by town and licence."""
+    of_maps = [map_licence for _, map_licence in maps]
+    chosen = licence or of_maps[0]
+    if chosen == UNKNOWN_LICENCE or (licence is None and len({*of_maps}) > 1):
         raise ConfigError(
             "the maps state no licence, or different ones", where="release.licence",
-            got=", ".join(f"{name}: {one}" for name, one in maps),
+            got=", ".join(f"{town}: {map_licence}" for town, map_licence in maps),
             expected="a licence identifier of the Hugging Face Hub",
             fix="pass --set release.licence=LICENCE, such as cc-by-4.0 or apache-2.0",
         )  # fmt: skip

@@ -38,7 +38,7 @@ from release.build.captions import CaptionAccount
 from release.build.config import ReleaseConfig
 from release.build.plan import Chosen, ReleasePlan, make_plan
 from release.build.shards import ShardResult, points_part, write_shard
-from release.build.sources import Source, input_names, told_apart
+from release.build.sources import Source, input_names, with_unique_names
 from release.card.render import render_card
 from release.columns import SplitName, published
 from release.counting import count_release, numbers_of
@@ -48,7 +48,6 @@ from release.record import (
     CaptionHistory,
     FlightHistory,
     History,
-    MadeBy,
     Numbers,
     Provenance,
     ReleasedFlight,
@@ -57,6 +56,7 @@ from release.record import (
     Settings,
     Shard,
     SourceRecord,
+    SourceStage,
     Splits,
     digest_of,
     numbers_of_splits,
@@ -93,14 +93,16 @@ def make_worker(files: tuple[FrameFile, ...], row_group_bytes: int, parts: Path)
 def _write_parts(
     cfg: ReleaseConfig, plan: ReleasePlan, stage: StageFolder, parts: Path, workers: int, watch: Watch
 ) -> list[tuple[Path, Shard]]:
-    """Write all shards that are not written yet; return all, and where they are until the release has its name."""
-    items = [Item(shard.name, shard.tracks, sum(len(one.selected) for one in shard.tracks)) for shard in plan.shards]
-    how = (cfg.modalities, cfg.row_group_bytes, parts)
-    finished = run_items(stage, items, make_worker, how, workers=workers, watch=watch, label="release: frames")
+    """Write all shards that are not written yet; return all, with their files until the release has its name."""
+    items = [
+        Item(shard.name, shard.tracks, sum(len(track.selected) for track in shard.tracks)) for shard in plan.shards
+    ]
+    arguments = (cfg.modalities, cfg.row_group_bytes, parts)
+    finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="release: frames")
     if failed := [record for record in finished.records if isinstance(record, Failed)]:
-        kind = VerifyError if {one.code for one in failed} == {VerifyError.code} else InputError
-        problems = ["nothing is released, because shards have problems", *(one.message for one in failed)]
-        raise kind.of_all(problems, where=stage.path / "failures.jsonl")
+        error_class = VerifyError if {failure.code for failure in failed} == {VerifyError.code} else InputError
+        problems = ["nothing is released, because shards have problems", *(failure.message for failure in failed)]
+        raise error_class.of_all(problems, where=stage.path / "failures.jsonl")
     written = [result_of(record, ShardResult) for record in finished.kept]
     return [
         (part_path(parts, shard.name), Shard(split=shard.split, **vars(result.frames), points=result.points))
@@ -109,14 +111,11 @@ def _write_parts(
 
 
 def name_shards(parts: Sequence[tuple[Path, Shard]], folder: Path) -> list[Shard]:
-    """Link shards under their names in the release, so that no byte moves and a kill costs nothing.
-
-    Args:
-        parts: Where they are until the release has its name, and what they are; their paths are not read.
-    """
+    """Link the files of shards under their names in the release, so that no byte moves and a kill costs nothing; return
+    the shards with these names."""
     digest = digest_of([shard for _, shard in parts])
-    for place in (FRAMES_FOLDER, POINTS_FOLDER):
-        (folder / place).mkdir()
+    for name in (FRAMES_FOLDER, POINTS_FOLDER):
+        (folder / name).mkdir()
     shards = []
     paths = shard_paths([shard.split for _, shard in parts], digest)
     for (part, shard), (frames, points) in zip(parts, paths, strict=True):
@@ -137,11 +136,7 @@ def name_shards(parts: Sequence[tuple[Path, Shard]], folder: Path) -> list[Shard
 
 
 def provenance_of(sources: list[Source], inputs: Mapping[str, StageInput], account: CaptionAccount) -> Provenance:
-    """Return what the record says of the sources and of all their captions.
-
-    Args:
-        inputs: Of the stage, by their names (`input_names`).
-    """
+    """Return the provenance in the record: of the sources, inputs of the stage (`input_names`), and their captions."""
     versions = {"cosfly": cosfly.__version__, "python": platform.python_version()}
     return Provenance(
         versions=versions | {"pyarrow": pa.__version__, "numpy": np.__version__},
@@ -158,7 +153,7 @@ def provenance_of(sources: list[Source], inputs: Mapping[str, StageInput], accou
 def _source(source: Source, names: dict[str, str], inputs: Mapping[str, StageInput]) -> SourceRecord:
     sha256 = {f"{role}_sha256": inputs[names[role]].sha256 for role in SOURCE_FILES if role in names}
     stages = [
-        MadeBy(stage=one.stage, code_version=one.code_version, seed=one.seed, config=published(one.config))
+        SourceStage(stage=one.stage, code_version=one.code_version, seed=one.seed, config=published(one.config))
         for one in stages_behind(source.files.values())
     ]
     return SourceRecord(run=source.run, stages=stages, **sha256)
@@ -166,47 +161,44 @@ def _source(source: Source, names: dict[str, str], inputs: Mapping[str, StageInp
 
 def stages_behind(products: Iterable[Path]) -> list[StageRecord]:
     """Return the records of the stages that made some products, each after those of its inputs that are unchanged."""
-    found: set[str] = set()
+    visited: set[str] = set()
     ordered: list[StageRecord] = []
 
-    def visit(record: StageRecord | None) -> None:
+    def visit(product: Path) -> None:
+        record = record_of(product)
         if record is None:
             return
-        made_of = sorted((name, entry.sha256) for name, entry in record.inputs.items())
-        known = dump_json([record.stage, record.seed, record.config, made_of])  # without the place on disk
-        if known in found:
+        digests = sorted((name, stage_input.sha256) for name, stage_input in record.inputs.items())
+        key = dump_json([record.stage, record.seed, record.config, digests])  # the same wherever it is on disk
+        if key in visited:
             return
-        found.add(known)
-        for entry in record.inputs.values():
-            before = Path(entry.path)
-            if before.exists() and (earlier := record_of(before)) and fingerprint(before) == entry.sha256:
-                visit(earlier)
+        visited.add(key)
+        for stage_input in record.inputs.values():
+            path = Path(stage_input.path)
+            if path.exists() and record_of(path) and fingerprint(path) == stage_input.sha256:
+                visit(path)
         ordered.append(record)
 
-    for path in products:
-        visit(record_of(path))
+    for product in products:
+        visit(product)
     return ordered
 
 
 def make_record(
-    cfg: ReleaseConfig,
-    plan: ReleasePlan,
-    shards: list[Shard],
-    numbers: Numbers,
-    provenance: Provenance,
+    cfg: ReleaseConfig, plan: ReleasePlan, shards: list[Shard], numbers: Numbers, provenance: Provenance
 ) -> ReleaseRecord:
-    """Return what release.json says of its shards."""
+    """Return the content of release.json."""
     tracks = [track for shard in plan.shards for track in shard.tracks]
     flights = [
         ReleasedFlight(
-            flight=one.name, frames=len(one.selected), frames_available=one.num_frames, split=one.placement.split,
-            walk=one.placement.walk, pair=one.placement.pair, five_ray_mean=one.candidate.five_ray_mean,
+            flight=track.name, frames=len(track.selected), frames_available=track.num_frames,
+            **vars(track.placement), five_ray_mean=track.candidate.five_ray_mean,
         )
-        for one in tracks
+        for track in tracks
     ]  # fmt: skip
     captions = Counter[SplitName]()
-    for one in tracks:
-        captions[one.placement.split] += len(one.captioned)
+    for track in tracks:
+        captions[track.placement.split] += len(track.captioned)
     settings = Settings(
         selection=cfg.selection, num_frames=cfg.num_frames, window_frames=plan.account.window_frames, pairs=cfg.pairs,
         tracks=[*cfg.tracks], modalities=[*cfg.modalities],
@@ -225,24 +217,21 @@ def make_record(
 
 def _history(plan: ReleasePlan, tracks: list[Chosen]) -> History:
     """Return what became of all tracks and captions; `release verify` checks that it adds up."""
-    account, candidates = plan.account, plan.material.candidates
-    without = Counter[str]()
-    for one in tracks:
-        without.update(one.captions.why_none(i) for i in {*one.selected} - {*one.captioned})
-    num_released = sum(len(one.captioned) for one in tracks)
+    account = plan.account
+    without_caption = Counter[str]()
+    for track in tracks:
+        without_caption.update(track.captions.why_none(i) for i in {*track.selected} - {*track.captioned})
+    num_released = sum(len(track.captioned) for track in tracks)
     captions = CaptionHistory(
-        read=account.accepted + account.dropped.total(),
-        dropped=dict(sorted(account.dropped.items())),
-        released=num_released,
-        frame_not_selected=sum(len(one.captions.spans) for one in tracks) - num_released,
-        flight_left_out=account.of_no_flight,
-        frames_without=dict(sorted(without.items())),
-    )
-    found = FlightHistory(
-        found=len(candidates), inspected=plan.material.num_inspected, released=len(tracks),
+        read=account.accepted + account.dropped.total(), dropped=dict(sorted(account.dropped.items())),
+        released=num_released, frame_not_selected=sum(len(track.captions.spans) for track in tracks) - num_released,
+        flight_left_out=account.of_other_tracks, frames_without=dict(sorted(without_caption.items())),
+    )  # fmt: skip
+    flights = FlightHistory(
+        found=len(plan.material.candidates), inspected=plan.material.num_inspected, released=len(tracks),
         left_out=dict(sorted(plan.dropped.items())),
     )  # fmt: skip
-    return History(trajectories=plan.material.trajectories, flights=found, captions=captions)
+    return History(trajectories=plan.material.trajectories, flights=flights, captions=captions)
 
 
 def write_records(folder: Path, record: ReleaseRecord) -> None:
@@ -258,22 +247,15 @@ def write_records(folder: Path, record: ReleaseRecord) -> None:
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
-def run(
-    cfg: ReleaseConfig,
-    sources: list[Source],
-    out: Path,
-    *,
-    workers: int = 0,
-    watch: Watch = Watch(),
-) -> Path:
-    """Read the playback tree, the captions and, where there is one, the inspection of each run; write `dataset/` and
+def run(cfg: ReleaseConfig, sources: list[Source], out: Path, *, workers: int = 0, watch: Watch = Watch()) -> Path:
+    """Read the playback tree, the captions and the inspection, if there is one, of each run; write `dataset/` and
     return its path.
 
     Raises:
         InputError, VerifyError: The material has problems; nothing is published, and finished shards stay for the next
             run.
     """
-    sources = told_apart(sources)
+    sources = with_unique_names(sources)
     names = input_names(sources)
     inputs = {
         name: source.files[role] for source, roles in zip(sources, names, strict=True) for role, name in roles.items()
@@ -285,9 +267,9 @@ def run(
         return dataset
     shutil.rmtree(dataset, ignore_errors=True)  # of another attempt: until this one is whole, nothing is published
     plan = make_plan(cfg, sources, stage)
-    if bare := [track.name for track in plan.tracks if not track.captioned]:
+    if without_caption := [track.name for track in plan.tracks if not track.captioned]:
         what = "release: %d of %d tracks have no caption of a released frame, such as %s; the card has the reasons"
-        log.warning(what, len(bare), len(plan.tracks), bare[0])
+        log.warning(what, len(without_caption), len(plan.tracks), without_caption[0])
     written = _write_parts(cfg, plan, stage, parts, workers, watch)
     with atomic_folder(dataset) as folder:
         shards = name_shards(written, folder)

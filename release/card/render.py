@@ -25,30 +25,19 @@ def render_card(record: ReleaseRecord) -> str:
     numbers, splits = record.numbers, record.splits.splits
     decided, repairs = numbers.of("decision"), numbers.of("repair_strategy")
     return markdown(
-        "release/card/template.md",
-        record=record,
-        numbers=numbers,
-        flags=numbers.of("flags"),
-        teacher_kind=numbers.of("teacher_kind"),
-        label_from=numbers.of("label_from"),
-        splits=splits,
-        modalities=record.settings.modalities,
-        front_matter=_front_matter(record),
+        "release/card/template.md", record=record, numbers=numbers, flags=numbers.of("flags"),
+        teacher_kind=numbers.of("teacher_kind"), label_from=numbers.of("label_from"), splits=splits,
+        modalities=record.settings.modalities, front_matter=_front_matter(record),
         ours=[source.run for source in record.provenance.sources if _is_rendered_by_us(source)],
         others=[source.run for source in record.provenance.sources if not _is_rendered_by_us(source)],
-        first_split=next(iter(splits), "train"),
-        points=sum(shard.points.rows for shard in record.shards),
-        is_whole=all(one.frames == one.frames_available for one in record.flights),
-        tables=tables_of(record),
-        shown=shown,
-        fields=FIELDS,
-        never_decided=[name for name in TOKENS if name not in decided],
+        first_split=next(iter(splits), "train"), points=sum(shard.points.rows for shard in record.shards),
+        is_whole=all(one.frames == one.frames_available for one in record.flights), tables=tables_of(record),
+        shown=shown, fields=FIELDS, never_decided=[name for name in TOKENS if name not in decided],
         most_decided=max(decided.items(), key=lambda pair: pair[1], default=("none", 0)),
         repaired=repairs.total() - repairs["none"],
         small_splits=[name for name, own in splits.items() if len(own.walks) < FEW_WALKS],
-        coordinates=_coordinates(record),
-        citation=read_text(Path(__file__).with_name("citation.bib")).strip(),
-    )
+        coordinates=_coordinates(record), citation=read_text(Path(__file__).with_name("citation.bib")).strip(),
+    )  # fmt: skip
 
 
 def _is_rendered_by_us(source: SourceRecord) -> bool:

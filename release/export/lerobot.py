@@ -69,70 +69,75 @@ VECTORS = {  # feature -> the release's column and its members
 def features_of(modalities: Sequence[FrameFile], size_px: tuple[int, int], fps: int, video: bool) -> dict[str, Any]:
     """Return the features of `info.json`; pictures are (width, height) px."""
     width, height = size_px
-    found: dict[str, dict[str, Any]] = {}
+    features: dict[str, dict[str, Any]] = {}
     for file in modalities:
-        shape, names = [height, width, 3], ["height", "width", "channels"]
-        camera: dict[str, Any] = {"dtype": "image", "shape": shape, "names": names}
+        camera: dict[str, Any] = {
+            "dtype": "image", "shape": [height, width, 3], "names": ["height", "width", "channels"],
+        }  # fmt: skip
         if file == "depth":
             camera |= {"shape": [height, width, 1], "info": {"is_depth_map": True, "depth_unit": "m"}}
         elif video:
-            info = {"height": height, "width": width, "codec": "av1", "pix_fmt": "yuv420p", "is_depth_map": False}
-            info |= {"fps": fps, "channels": 3}
-            camera |= {"dtype": "video", "info": {f"video.{name}": value for name, value in info.items()}}
-            camera["info"]["has_audio"] = False
-        found[CAMERAS[file]] = camera
-    members = {STATE: ACTION} | {name: names for name, (_, names) in VECTORS.items()}
-    found |= {name: {"dtype": "float32", "shape": [len(m)], "names": list(m)} for name, m in members.items()}
+            info = {
+                "video.height": height, "video.width": width, "video.codec": "av1", "video.pix_fmt": "yuv420p",
+                "video.is_depth_map": False, "video.fps": fps, "video.channels": 3, "has_audio": False,
+            }  # fmt: skip
+            camera |= {"dtype": "video", "info": info}
+        features[CAMERAS[file]] = camera
+    for name, members in {STATE: ACTION, **{name: members for name, (_, members) in VECTORS.items()}}.items():
+        features[name] = {"dtype": "float32", "shape": [len(members)], "names": list(members)}
     scalars = dict.fromkeys(NUMBERS, "float32") | dict.fromkeys((*FLAGS, "next.done"), "bool")
     scalars |= dict.fromkeys(TEXTS, "string") | DEFAULTS
-    return found | {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in scalars.items()}
+    return features | {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in scalars.items()}
 
 
 def schema_of(features: dict[str, Any]) -> pa.Schema:
     """Return the parquet schema of features, as lerobot derives it; videos are not in the tables."""
     from datasets import Features, Image, List, Value
 
-    found: dict[str, Any] = {}
+    columns: dict[str, Any] = {}
     for name, feature in features.items():
         if feature["dtype"] == "image":
-            found[name] = Image()
+            columns[name] = Image()
         elif feature["dtype"] != "video":
             value, (length,) = Value(feature["dtype"]), feature["shape"]
-            found[name] = value if length == 1 else List(value, length=length)
-    return Features(found).arrow_schema
+            columns[name] = value if length == 1 else List(value, length=length)
+    return Features(columns).arrow_schema
 
 
 def states(rows: list[Row]) -> np.ndarray:
-    """Return the motion that a drone knows at each frame, (n, 5) as ACTION: the mean velocities of the step that led
-    there, and the camera's pitch. At the first frame it has not moved."""
+    """Return the motion that a drone knows at each frame, (n, 5) as ACTION: the mean velocities of the step that ends
+    there, in the axes at its end, and the camera's pitch. At the first frame it has not moved."""
     pose = vectors(rows, "pose", POSE)
     time_s = np.array([row["time_s"] for row in rows])
-    # In the axes of the end of each step.
-    motion = PlannedMotion(time_s, pose, np.roll(pose[:, 4], -1), pose[:, :3])
-    found = np.zeros((len(rows), len(ACTION)))
-    found[1:, :4] = motion.action[:-1, :4]
-    found[:, 4] = pose[:, 3]
-    return found
+    yaw_deg, pitch_deg = pose[:, 4], pose[:, 3]
+    motion = PlannedMotion(time_s, pose, np.roll(yaw_deg, -1), pose[:, :3])
+    known = np.zeros((len(rows), len(ACTION)))
+    known[1:, :4] = motion.action[:-1, :4]
+    known[:, 4] = pitch_deg
+    return known
 
 
-def values_of(rows: list[Row], episode: int, index: int, fps: int, tasks: Sequence[int]) -> dict[str, Any]:
-    """Return the values of all features of an episode but the pictures: arrays (n,) or (n, d), and lists of texts. A
-    missing number is NaN, a missing text empty. index: Of its first frame in the whole."""
+def values_of(rows: list[Row], episode: int, first: int, fps: int, tasks: Sequence[int]) -> dict[str, Any]:
+    """Return the values of all features of an episode but its pictures: arrays (n,) or (n, d), and lists of n texts. A
+    missing number is NaN, a missing text empty. first: number of its first frame in the data set."""
     n = len(rows)
-    found: dict[str, Any] = {
+    values: dict[str, Any] = {
         name: vectors(rows, column, members).astype(np.float32) for name, (column, members) in VECTORS.items()
     }
-    found[STATE] = states(rows).astype(np.float32)
-    found[ACTED] = np.nan_to_num(found[ACTED])  # trainers take no NaN: nothing follows the last frame
-    found |= {name: np.array([row[name] for row in rows], dtype=np.float32) for name in NUMBERS}
-    found |= {name: np.array([bool(row[name]) for row in rows]) for name in FLAGS}
-    found |= {name: [row[name] or "" for row in rows] for name in TEXTS}
-    order = np.arange(n, dtype=np.int64)
-    return found | {
-        "next.done": order == n - 1, "frame_index": order, "timestamp": (order / fps).astype(np.float32),
-        "episode_index": np.full(n, episode, dtype=np.int64), "index": index + order,
+    values[STATE] = states(rows).astype(np.float32)
+    values[ACTED] = np.nan_to_num(values[ACTED])  # the last frame has no action, and trainers take no NaN
+    values |= {name: np.array([row[name] for row in rows], dtype=np.float32) for name in NUMBERS}
+    values |= {name: np.array([bool(row[name]) for row in rows]) for name in FLAGS}
+    values |= {name: [row[name] or "" for row in rows] for name in TEXTS}
+    frames = np.arange(n, dtype=np.int64)
+    return values | {
+        "next.done": frames == n - 1,
+        "frame_index": frames,
+        "timestamp": (frames / fps).astype(np.float32),
+        "episode_index": np.full(n, episode, dtype=np.int64),
+        "index": first + frames,
         "task_index": np.array(tasks, dtype=np.int64),
-    }  # fmt: skip
+    }
 
 
 def task_of(goal: str, decision: str) -> str:
@@ -144,22 +149,26 @@ def task_of(goal: str, decision: str) -> str:
 # --- statistics -------------------------------------------------------------------------------------------------------
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-SAMPLED_FRAMES, PIXEL_STEP = 5, 4  # pictures of an episode, and pixels of a picture, that count
+SAMPLED_FRAMES = 5  # of an episode, whose pictures count
+PIXEL_STEP = 4  # every fourth row and column of a picture counts
 Summary = dict[str, list]  # name of the statistic -> values, nested as lerobot has them
 
 
 def summarize(values: np.ndarray, count: int, *, is_picture: bool = False) -> Summary:
-    """Summarize (k, d) values without NaN; `count` is the number of frames they are of. Without any value all is zero,
-    and so is the count."""
+    """Summarize (k, d) values of `count` frames; NaN is skipped. If all are NaN, the statistics and the count are 0."""
     has_any = (~np.isnan(values)).any(axis=0)
     filled = np.where(has_any, values, 0.0)
-    found = {
-        "min": np.nanmin(filled, axis=0), "max": np.nanmax(filled, axis=0),
-        "mean": np.nanmean(filled, axis=0), "std": np.nanstd(filled, axis=0),
+    statistics = {
+        "min": np.nanmin(filled, axis=0),
+        "max": np.nanmax(filled, axis=0),
+        "mean": np.nanmean(filled, axis=0),
+        "std": np.nanstd(filled, axis=0),
         **{name: np.nanquantile(filled, share, axis=0) for name, share in QUANTILES.items()},
-    }  # fmt: skip
-    nested = {name: (value.reshape(-1, 1, 1) if is_picture else value).tolist() for name, value in found.items()}
-    return nested | {"count": [count if has_any.any() else 0]}
+    }
+    if is_picture:
+        statistics = {name: value.reshape(-1, 1, 1) for name, value in statistics.items()}
+    summary = {name: value.tolist() for name, value in statistics.items()}
+    return summary | {"count": [count if has_any.any() else 0]}
 
 
 def merged(summaries: Sequence[Summary]) -> Summary:
@@ -168,14 +177,15 @@ def merged(summaries: Sequence[Summary]) -> Summary:
     counts = np.array([part["count"][0] for part in parts], dtype=np.float64)
     weights = counts / counts.sum() if counts.sum() else np.full(len(parts), 1 / len(parts))
     stacked = {name: np.array([part[name] for part in parts], dtype=np.float64) for name in parts[0] if name != "count"}
-    found: dict[str, Any] = {name: np.tensordot(weights, stacked[name], axes=1) for name in (*QUANTILES, "mean")}
-    variance = np.tensordot(weights, stacked["std"] ** 2 + (stacked["mean"] - found["mean"]) ** 2, axes=1)
-    found |= {"min": stacked["min"].min(axis=0), "max": stacked["max"].max(axis=0), "std": np.sqrt(variance)}
-    return {name: value.tolist() for name, value in found.items()} | {"count": [int(counts.sum())]}
+    result: dict[str, Any] = {name: np.tensordot(weights, stacked[name], axes=1) for name in (*QUANTILES, "mean")}
+    variance = np.tensordot(weights, stacked["std"] ** 2 + (stacked["mean"] - result["mean"]) ** 2, axes=1)
+    result |= {"min": stacked["min"].min(axis=0), "max": stacked["max"].max(axis=0), "std": np.sqrt(variance)}
+    return {name: value.tolist() for name, value in result.items()} | {"count": [int(counts.sum())]}
 
 
 def _merge_all(stats: Sequence[dict[str, Summary]]) -> dict[str, Summary]:
-    return {name: merged([one[name] for one in stats]) for name in stats[0]}
+    """Merge the summaries of each feature."""
+    return {name: merged([summaries[name] for summaries in stats]) for name in stats[0]}
 
 
 # --- the export -------------------------------------------------------------------------------------------------------
@@ -183,13 +193,13 @@ def _merge_all(stats: Sequence[dict[str, Summary]]) -> dict[str, Summary]:
 
 @dataclass(frozen=True)
 class Layout:
-    """What a file must know of the whole. file: Its number. episode, index: Numbers of its first episode and frame."""
+    """The place of a file in the data set."""
 
-    file: int
-    episode: int
-    index: int
+    file: int  # its number
+    episode: int  # number of its first episode
+    index: int  # number of its first frame
     fps: int
-    size_px: tuple[int, int]
+    size_px: tuple[int, int]  # of all pictures
 
     @property
     def place(self) -> dict[str, int]:
@@ -197,62 +207,74 @@ class Layout:
 
 
 def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
-    """Index episodes and frames; write the data files and `meta/`."""
-    tasks = dict[str, int]()  # in words -> number
-
-    def episodes() -> Iterator[SourceTrack]:
-        for track in source.tracks():
-            decisions = {row["decision"] or "" for row in track.rows}
-            if unknown := decisions - {"", *TOKENS}:
-                raise not_in_set(", ".join(sorted(unknown))[:200], track.name)
-            for one in ("", *TOKENS):
-                if one in decisions:
-                    tasks.setdefault(task_of(track.rows[0]["goal_en"] or "", one), len(tasks))
-            gaps = np.flatnonzero(np.diff(track.frame_index) != 1) + 1
-            yield from track.cut([0, *gaps.tolist(), len(track)])
-
-    fps, features = _fps(source.record), dict[str, Any]()
-    layout, stats, counts = Layout(0, 0, 0, fps, (0, 0)), list[dict[str, Summary]](), Counter[str]()
-    for name, own in shards(episodes(), cfg.shard_mb):
-        first = next(own)
+    """Write the data files, an episode after the other, and `meta/`."""
+    tasks = dict[str, int]()  # task -> number
+    features = dict[str, Any]()
+    stats: list[dict[str, Summary]] = []  # of each file
+    episodes_of_split = Counter[str]()
+    layout = Layout(file=0, episode=0, index=0, fps=_fps(source.record), size_px=(0, 0))
+    for name, episodes in shards(_episodes(source, tasks), cfg.shard_mb):
+        first = next(episodes)
         if cfg.video and any(side % 2 for side in first.size_px):
             got, fix = "{} x {} px".format(*first.size_px), "export without --video"
             raise InputError("--video needs pictures of even width and height", where=source.folder, got=got, fix=fix)
-        features = features or features_of(source.modalities, first.size_px, fps, cfg.video)
         if not layout.file:
             layout = replace(layout, size_px=first.size_px)
-        rows = _write_file(source, itertools.chain([first], own), layout, features, tasks, folder, advance)
+            features = features_of(source.modalities, first.size_px, layout.fps, cfg.video)
+        rows = _write_file(source, itertools.chain([first], episodes), layout, features, tasks, folder, advance)
         stats.append(_merge_all([row["stats"] for row in rows]))
-        counts[name.rpartition("-")[0]] += len(rows)
+        split, _, _ = name.rpartition("-")
+        episodes_of_split[split] += len(rows)
         episode, index = layout.episode + len(rows), rows[-1]["dataset_to_index"]
         layout = replace(layout, file=layout.file + 1, episode=episode, index=index)
-    ends = dict(zip(counts, itertools.accumulate(counts.values()), strict=True))
+    ends = itertools.accumulate(episodes_of_split.values())
     info = {
         "codebase_version": VERSION, "robot_type": "cosfly_drone", "total_episodes": layout.episode,
-        "total_frames": layout.index, "total_tasks": len(tasks), "chunks_size": CHUNK, "fps": fps,
-        "splits": {split: f"{end - counts[split]}:{end}" for split, end in ends.items()},
+        "total_frames": layout.index, "total_tasks": len(tasks), "chunks_size": CHUNK, "fps": layout.fps,
+        "splits": {
+            split: f"{end - count}:{end}" for (split, count), end in zip(episodes_of_split.items(), ends, strict=True)
+        },
         "data_path": DATA_PATH, "video_path": VIDEO_PATH if cfg.video else None, "features": features,
         "data_files_size_in_mb": cfg.shard_mb, "video_files_size_in_mb": cfg.shard_mb,
     }  # fmt: skip
-    for name, content in (("stats", _merge_all(stats)), ("info", info)):
-        write_bytes(folder / f"meta/{name}.json", dump_json(content, indent=4).encode())
+    write_bytes(folder / "meta/stats.json", dump_json(_merge_all(stats), indent=4).encode())
+    write_bytes(folder / "meta/info.json", dump_json(info, indent=4).encode())
+    _write_tasks(folder / "meta/tasks.parquet", list(tasks))
+    facts = {"num_episodes": layout.episode, "fps": layout.fps, "has_depth": "depth" in source.modalities}
+    return FormatFacts(facts, split_files={"train": "data/*/*.parquet"})
+
+
+def _episodes(source: ExportSource, tasks: dict[str, int]) -> Iterator[SourceTrack]:
+    """Yield the tracks, cut at gaps between their frames, and give their new tasks the next numbers in `tasks`."""
+    for track in source.tracks():
+        decisions = {row["decision"] or "" for row in track.rows}
+        if unknown := decisions - {"", *TOKENS}:
+            raise not_in_set(", ".join(sorted(unknown))[:200], track.name)
+        for decision in ("", *TOKENS):
+            if decision in decisions:
+                tasks.setdefault(task_of(track.rows[0]["goal_en"] or "", decision), len(tasks))
+        gaps = np.flatnonzero(np.diff(track.frame_index) != 1) + 1
+        yield from track.cut([0, *gaps.tolist(), len(track)])
+
+
+def _write_tasks(path: Path, tasks: list[str]) -> None:
+    """Write the table of tasks, whose texts lerobot reads as the index of a data frame."""
     import pandas as pd
 
-    buffer = io.BytesIO()  # lerobot reads the text as the index of a data frame
-    table = pd.DataFrame({"task_index": range(len(tasks))}, index=pd.Index(list(tasks), name="task"))
-    table.to_parquet(buffer)
-    write_bytes(folder / "meta/tasks.parquet", buffer.getvalue())
-    facts = {"num_episodes": layout.episode, "fps": fps, "has_depth": "depth" in source.modalities}
-    return FormatFacts(facts, split_files={"train": "data/*/*.parquet"})
+    buffer = io.BytesIO()
+    pd.DataFrame({"task_index": range(len(tasks))}, index=pd.Index(tasks, name="task")).to_parquet(buffer)
+    write_bytes(path, buffer.getvalue())
 
 
 def _fps(record: ReleaseRecord) -> int:
     """Return the number of frames per second; it must be whole and the same in all tracks."""
-    steps_s = [float(step) for step in record.numbers.of("step_s")]  # rounded: the mean of all is not
+    steps_s = [float(step) for step in record.numbers.of("step_s")]  # rounded to milliseconds
+    num_steps = sum(track.frames_available - 1 for track in record.flights)
     duration = record.numbers.spreads.get("track_duration_s", Spread())
-    num_steps = sum(one.frames_available - 1 for one in record.flights)
-    whole_s = (duration.mean or 0.0) * duration.count
-    fps = round(num_steps / whole_s) if whole_s > STEP_TOLERANCE_S else 0 if steps_s else PAPER_FPS
+    total_s = (duration.mean or 0.0) * duration.count
+    fps = 0 if steps_s else PAPER_FPS  # tracks of one frame have no steps
+    if total_s > STEP_TOLERANCE_S:
+        fps = round(num_steps / total_s)
     if any(abs(step - 1 / (fps or 1)) > STEP_TOLERANCE_S for step in steps_s):
         what = "LeRobot needs a whole number of frames per second, the same in all tracks"
         raise InputError(what, where="time_s", got=f"steps of {', '.join(map(str, sorted(steps_s)[:10]))} s")
@@ -260,28 +282,28 @@ def _fps(record: ReleaseRecord) -> int:
 
 
 def _write_file(
-    source: ExportSource, pieces: Iterable[SourceTrack], layout: Layout, features: dict[str, Any],
+    source: ExportSource, episodes: Iterable[SourceTrack], layout: Layout, features: dict[str, Any],
     tasks: dict[str, int], folder: Path, advance: Advance,
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """Write a data file, its videos, and its part of the table of episodes; return what that has of each episode."""
+    """Write a data file, its videos, and its part of the table of episodes; return the rows of that table."""
     schema = schema_of(features)
-    cameras = [name for name, one in features.items() if one["dtype"] == "video"]
+    cameras = [name for name, feature in features.items() if feature["dtype"] == "video"]
     texts = [field.name for field in schema if pa.types.is_string(field.type)]
     options: dict[str, Any] = {"compression": "zstd", "use_dictionary": texts, "write_statistics": ["episode_index"]}
-    episodes, first = list[dict[str, Any]](), layout.index
+    rows: list[dict[str, Any]] = []
+    first = layout.index
     with contextlib.ExitStack() as stack:
         file = stack.enter_context(atomic_file(folder / DATA_PATH.format(**layout.place)))
         table = stack.enter_context(pq.ParquetWriter(file, schema, **options))
         paths = {name: folder / VIDEO_PATH.format(video_key=name, **layout.place) for name in cameras}
         videos = {name: stack.enter_context(video_writer(path, layout)) for name, path in paths.items()}
-        for number, piece in enumerate(pieces, layout.episode):
-            row = _write_episode(source, piece, number, first, layout, features, tasks, table, videos, advance)
-            episodes.append(row)
-            first += len(piece)
+        for number, episode in enumerate(episodes, layout.episode):
+            rows.append(_write_episode(source, episode, number, first, layout, features, tasks, table, videos, advance))
+            first += len(episode)
     buffer = io.BytesIO()
-    pq.write_table(pa.Table.from_pylist([_episode_row(row, layout, cameras) for row in episodes]), buffer)
+    pq.write_table(pa.Table.from_pylist([_flat_row(row, layout, cameras) for row in rows]), buffer)
     write_bytes(folder / EPISODES_PATH.format(**layout.place), buffer.getvalue())
-    return episodes
+    return rows
 
 
 @contextlib.contextmanager
@@ -301,17 +323,19 @@ def video_writer(path: Path, layout: Layout) -> Iterator[Callable[[np.ndarray], 
 
 def _write_episode(
     source: ExportSource, track: SourceTrack, number: int, first: int, layout: Layout, features: dict[str, Any],
-    numbers: dict[str, int], table: pq.ParquetWriter, videos: dict[str, Callable[[np.ndarray], None]], advance: Advance,
+    task_numbers: dict[str, int], table: pq.ParquetWriter, videos: dict[str, Callable[[np.ndarray], None]],
+    advance: Advance,
 ) -> dict[str, Any]:  # fmt: skip
-    """Write the rows of an episode; return what the table of episodes has of it."""
+    """Write the rows and pictures of an episode, of this number and first frame; return its row of the table of
+    episodes."""
     if track.size_px != layout.size_px:
         problem, fix = "the lerobot export needs pictures of one size", "build one release for each size"
         got, expected = ("{} x {} px".format(*size) for size in (track.size_px, layout.size_px))
         raise InputError(problem, where=track.name, got=got, expected=expected, fix=fix)
     n = len(track)
     tasks = [task_of(row["goal_en"] or "", row["decision"] or "") for row in track.rows]
-    values = values_of(track.rows, number, first, layout.fps, [numbers[task] for task in tasks])
-    pixels: dict[str, list[np.ndarray]] = {CAMERAS[file]: [] for file in source.modalities}
+    values = values_of(track.rows, number, first, layout.fps, [task_numbers[task] for task in tasks])
+    pixels: dict[str, list[np.ndarray]] = {CAMERAS[file]: [] for file in source.modalities}  # for the statistics
     sampled = {int(i) for i in np.linspace(0, n - 1, min(n, SAMPLED_FRAMES)).round()}
     frames = track.frames()
     for start in range(0, n, ROWS_HELD):
@@ -329,7 +353,7 @@ def _write_episode(
         part = slice(start, start + ROWS_HELD)
         columns = {name: images.get(name) or list(values[name][part]) for name in table.schema.names}
         table.write_table(pa.Table.from_pydict(columns, schema=table.schema))
-    stats = {name: summarize(np.concatenate(found), len(found), is_picture=True) for name, found in pixels.items()}
+    stats = {name: summarize(np.concatenate(parts), len(parts), is_picture=True) for name, parts in pixels.items()}
     for name, feature in features.items():
         if name not in pixels and feature["dtype"] != "string":
             stats[name] = summarize(np.asarray(values[name], dtype=np.float64).reshape(n, -1), n)
@@ -359,14 +383,15 @@ def _pixels(data: bytes, name: str, file: FrameFile) -> np.ndarray:
     return colours_of(data, name)[::PIXEL_STEP, ::PIXEL_STEP].reshape(-1, 3) / 255.0
 
 
-def _episode_row(row: dict[str, Any], layout: Layout, cameras: list[str]) -> dict[str, Any]:
+def _flat_row(row: dict[str, Any], layout: Layout, cameras: list[str]) -> dict[str, Any]:
+    """Return a row of the table of episodes with its files, the times in its videos, and flat statistics."""
     begin_s = (row["dataset_from_index"] - layout.index) / layout.fps
-    found = {name: value for name, value in row.items() if name != "stats"}
+    end_s = begin_s + row["length"] / layout.fps
+    flat = {name: value for name, value in row.items() if name != "stats"}
     for folder in ("data", "meta/episodes", *(f"videos/{name}" for name in cameras)):
-        found |= {f"{folder}/{name}": value for name, value in layout.place.items()}
+        flat |= {f"{folder}/{name}": value for name, value in layout.place.items()}
     for name in cameras:
-        end_s = begin_s + row["length"] / layout.fps
-        found |= {f"videos/{name}/from_timestamp": begin_s, f"videos/{name}/to_timestamp": end_s}
-    return found | {
-        f"stats/{name}/{kind}": values for name, summary in row["stats"].items() for kind, values in summary.items()
-    }
+        flat |= {f"videos/{name}/from_timestamp": begin_s, f"videos/{name}/to_timestamp": end_s}
+    for name, summary in row["stats"].items():
+        flat |= {f"stats/{name}/{statistic}": values for statistic, values in summary.items()}
+    return flat

@@ -36,7 +36,7 @@ from cosfly.runtime.png import png_size
 from cosfly.runtime.run_dir import StageFolder, Tally
 from cosfly.viz.page import markdown
 from release.columns import LANGUAGES, PICTURES, PLACE, SPLIT_NAMES, SplitName
-from release.reading import Pictures, Row, read_pictures, read_tracks
+from release.reading import Pictures, Row, TrackRows, read_pictures, read_tracks
 from release.record import RECORD, ReleaseRecord, read_record, release_folder
 from release.verify.findings import Findings
 from release.verify.verify import check_footers, check_names
@@ -50,23 +50,21 @@ BYTES_PER_PIXEL = 6  # of the three pictures of a frame, a typical value
 
 
 class Export(NamedTuple):
-    """One format. module: Its writer. pictures: It cannot do without these. carries: It can hold these; `default` of
-    them are written unless the settings choose others."""
+    """One format."""
 
-    module: str
-    pictures: tuple[FrameFile, ...] = ()
-    carries: tuple[FrameFile, ...] = tuple(FILE_NAMES)
-    default: tuple[FrameFile, ...] = tuple(FILE_NAMES)
-    needs_consecutive: bool = False  # chat: but for samples of the last frame alone
+    module: str  # its writer
+    needs: tuple[FrameFile, ...] = ()  # pictures that the writer reads
+    carries: tuple[FrameFile, ...] = tuple(FILE_NAMES)  # pictures that the format can hold
+    default: tuple[FrameFile, ...] = tuple(FILE_NAMES)  # those that are written unless the settings choose others
 
 
 EXPORTS: dict[FormatName, Export] = {
-    "tree": Export("release.export.tree", pictures=("rgb",)),
-    "lerobot": Export("release.export.lerobot", default=("rgb",), needs_consecutive=True),
+    "tree": Export("release.export.tree", needs=("rgb",)),
+    "lerobot": Export("release.export.lerobot", default=("rgb",)),
     "webdataset": Export("release.export.webdataset"),
-    "coco": Export("release.export.coco", ("rgb", "instance"), ("rgb",), ("rgb",)),
-    "chat": Export("release.export.chat", ("rgb",), ("rgb",), ("rgb",), needs_consecutive=True),
-    "sharegpt": Export("release.export.chat", ("rgb",), ("rgb",), ("rgb",), needs_consecutive=True),
+    "coco": Export("release.export.coco", needs=("rgb", "instance"), carries=("rgb",), default=("rgb",)),
+    "chat": Export("release.export.chat", needs=("rgb",), carries=("rgb",), default=("rgb",)),
+    "sharegpt": Export("release.export.chat", needs=("rgb",), carries=("rgb",), default=("rgb",)),
 }
 
 
@@ -82,18 +80,23 @@ class ExportConfig(Config):
     )
     frames: Literal["all", "last"] = Field("all", description="chat: pictures of the whole window or its last frame")
 
+    @property
+    def needs_consecutive(self) -> bool:
+        """Whether the format shows frames in their sequence, so that a release without gaps is needed."""
+        return self.format == "lerobot" or (self.format in ("chat", "sharegpt") and self.frames == "all")
+
 
 # --- the source -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class SourceTrack:
-    """One track, or some of its rows. rows: Without pictures. pictures: Of each row, in order; they are read once."""
+    """One track, or some of its rows."""
 
     place: Place
     split: SplitName
-    rows: list[Row]
-    pictures: Iterator[Pictures]
+    rows: list[Row]  # without pictures
+    pictures: Iterator[Pictures]  # of each row, in order; they are read once
 
     @property
     def name(self) -> str:
@@ -121,28 +124,32 @@ class SourceTrack:
             yield row, {file: self._checked(row, file, data) for file, data in pictures.items()}
 
     def _checked(self, row: Row, file: FrameFile, data: bytes | memoryview | None) -> bytes:
+        """Return a picture; InputError if it is missing, damaged, or of another size than the track."""
         where = f"{row['sample_id']}: {PICTURES[file].name}"
         if not data:
             raise InputError("the frame has no picture", where=where, got="no data")
-        data, size = bytes(data), png_size(data)
+        data = bytes(data)
         if file == "depth":
-            size = parse_array(data, where, dtype=np.float32, ndim=2, what="depth image", copy=False).shape[::-1]
-        if size is None:
+            depth = parse_array(data, where, dtype=np.float32, ndim=2, what="depth image", copy=False)
+            size_px: tuple[int, ...] | None = depth.shape[::-1]
+        else:
+            size_px = png_size(data)
+        if size_px is None:
             raise InputError("the picture of the frame is not a PNG file", where=where)
-        if size != self.size_px:
-            got, expected = ("{} x {} px".format(*one) for one in (size, self.size_px))
+        if size_px != self.size_px:
+            got, expected = "{} x {} px".format(*size_px), "{} x {} px".format(*self.size_px)
             raise InputError("the picture has another size than the track", where=where, got=got, expected=expected)
         return data
 
 
 @dataclass(frozen=True)
 class ExportSource:
-    """The release that is exported. modalities: The pictures that the export will hold. files: Those that it reads."""
+    """The release that is exported."""
 
     folder: Path
     record: ReleaseRecord
-    modalities: tuple[FrameFile, ...]
-    files: tuple[FrameFile, ...]
+    modalities: tuple[FrameFile, ...]  # pictures that the export will hold
+    files: tuple[FrameFile, ...]  # pictures that are read for it
 
     def tracks(self) -> Iterator[SourceTrack]:
         """Yield the tracks, splits in their order. The pictures of a track are read before the next track.
@@ -152,27 +159,30 @@ class ExportSource:
         """
         known = set[Place]()
         for shard in sorted(self.record.shards, key=lambda shard: (SPLIT_NAMES.index(shard.split), shard.path)):
-            path = self.folder / shard.path
             pictures = read_pictures(self.folder, shard, self.files)
             for frames, _ in read_tracks(self.folder, shard):
                 parts = [frames.rows[0][name] for name in PLACE]
                 place = Place(*parts)
                 if not all(map(PART.fullmatch, parts)) or place in known:
                     what = "the names of a track are not valid folder names, or the track occurs twice"
-                    raise InputError(what, where=path, got=shown(parts, 200))
+                    raise InputError(what, where=self.folder / shard.path, got=shown(parts, 200))
                 known.add(place)
-                ids = frames.column("sample_id")
-                if not all(map(PART.fullmatch, ids)) or len({*ids}) < len(ids):
-                    what = "the sample_id of a frame is repeated or is not a valid file name"
-                    raise InputError(what, where=frames.name, got=shown(ids, 200))
-                for name in ("width_px", "height_px"):
-                    if len({*frames.column(name)}) > 1:
-                        raise InputError("the pictures of the track differ in size", where=frames.name)
-                if (np.diff(frames.index) <= 0).any() or (np.diff(frames.time_s) <= 0).any():
-                    raise InputError("the indices and times of the frames do not increase", where=frames.name)
-                of_track = itertools.islice(pictures, len(frames))
-                yield SourceTrack(place, shard.split, list(frames.rows), of_track)
-                deque(of_track, maxlen=0)  # those that nobody has read
+                _check_frames(frames)
+                pictures_of_track = itertools.islice(pictures, len(frames))
+                yield SourceTrack(place, shard.split, list(frames.rows), pictures_of_track)
+                deque(pictures_of_track, maxlen=0)  # skip those that the writer has not read
+
+
+def _check_frames(frames: TrackRows) -> None:
+    """Check what writers rely on: ids that can be file names, one size of pictures, and increasing times."""
+    ids = frames.column("sample_id")
+    if not all(map(PART.fullmatch, ids)) or len({*ids}) < len(ids):
+        what = "the sample_id of a frame is repeated or is not a valid file name"
+        raise InputError(what, where=frames.name, got=shown(ids, 200))
+    if len({*frames.column("width_px")}) > 1 or len({*frames.column("height_px")}) > 1:
+        raise InputError("the pictures of the track differ in size", where=frames.name)
+    if (np.diff(frames.index) <= 0).any() or (np.diff(frames.time_s) <= 0).any():
+        raise InputError("the indices and times of the frames do not increase", where=frames.name)
 
 
 def key_of(sample_id: str) -> str:
@@ -195,8 +205,8 @@ def open_release(folder: Path, consecutive: str = "") -> ExportSource:
     if consecutive:
         record.require_whole_tracks(consecutive, folder)
     findings = Findings()
-    good = check_names(folder, record, findings)
-    if not (check_footers(folder, record, good, findings) and record.shards):
+    usable = check_names(folder, record, findings)
+    if not (check_footers(folder, record, usable, findings) and record.shards):
         raise InputError(
             "the release is incomplete", where=folder, got="; ".join(map(str, findings.issues)) or "no shards",
             expected="the shards in release.json", fix="run cosfly release verify for details",
@@ -207,50 +217,53 @@ def open_release(folder: Path, consecutive: str = "") -> ExportSource:
 
 @dataclass(frozen=True)
 class FormatFacts:
-    """What README.md says of an export.
+    """What README.md says of an export."""
 
-    values: Of the format's section of `readme.md`. coordinates: If the format has other axes than the release.
-    split_files: Split -> pattern of its files, where `datasets` opens the folder.
-    """
+    values: dict[str, Any] = field(default_factory=dict)  # for the format's section of `readme.md`
+    coordinates: dict[str, str] = field(default_factory=dict)  # if the format has other axes than the release
+    split_files: dict[str, str] = field(default_factory=dict)  # split -> pattern of its files, if `datasets` opens them
 
-    values: dict[str, Any] = field(default_factory=dict)
-    coordinates: dict[str, str] = field(default_factory=dict)
-    split_files: dict[str, str] = field(default_factory=dict)
+
+class _ShardNames:
+    """Names the shard of each piece; all pieces are passed once, in order."""
+
+    def __init__(self, shard_mb: int) -> None:
+        self.shard_bytes = shard_mb * MB
+        self.split = ""
+        self.number = 0
+        self.filled_bytes = 0
+
+    def next_name(self, piece: SourceTrack) -> str:
+        """Return the name of the shard that the next piece belongs to, such as `train-00000`."""
+        if piece.split != self.split:
+            self.split, self.number, self.filled_bytes = piece.split, 0, 0
+        elif self.filled_bytes >= self.shard_bytes:
+            self.number, self.filled_bytes = self.number + 1, 0
+        self.filled_bytes += len(piece) * math.prod(piece.size_px) * BYTES_PER_PIXEL
+        return f"{self.split}-{self.number:05d}"
 
 
 def shards(pieces: Iterable[SourceTrack], shard_mb: int) -> Iterator[tuple[str, Iterator[SourceTrack]]]:
-    """Group pieces of each split into files of about `shard_mb`; yield the name of each, `train-00000`, and its pieces,
-    which are read before the next file."""
-    split, number, filled = "", 0, 0
-
-    def name_of(piece: SourceTrack) -> str:
-        nonlocal split, number, filled
-        if piece.split != split:
-            split, number, filled = piece.split, 0, 0
-        elif filled >= shard_mb * MB:
-            number, filled = number + 1, 0
-        filled += len(piece) * math.prod(piece.size_px) * BYTES_PER_PIXEL
-        return f"{split}-{number:05d}"
-
-    return itertools.groupby(pieces, name_of)
+    """Group pieces of each split into files of about `shard_mb`; yield the name of each and its pieces, which are read
+    before the next file."""
+    return itertools.groupby(pieces, _ShardNames(shard_mb).next_name)
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
 def check_needs(source: ExportSource, cfg: ExportConfig) -> ExportSource:
-    """Return the source with the pictures that the format will hold; raise InputError if it lacks what the format
-    needs."""
+    """Return the source with the pictures that the format will hold; InputError if it lacks some that are needed."""
     export = EXPORTS[cfg.format]
     chosen = cfg.modalities or tuple(file for file in export.default if file in source.modalities)
-    for needed in (*export.pictures, *chosen):
+    for needed in (*export.needs, *chosen):
         if needed not in source.modalities:
             got, fix = f"a release with {', '.join(source.modalities)}", f"build a release with {needed} pictures"
             raise InputError(f"the {cfg.format} export needs {needed} pictures", where=source.folder, got=got, fix=fix)
     if unused := set(chosen) - set(export.carries):
         what = f"the {cfg.format} export cannot contain {' or '.join(sorted(unused))} pictures"
         raise InputError(what, where="--modalities", expected=f"some of {', '.join(export.carries)}")
-    return replace(source, modalities=chosen, files=tuple(dict.fromkeys((*chosen, *export.pictures))))
+    return replace(source, modalities=chosen, files=tuple(dict.fromkeys((*chosen, *export.needs))))
 
 
 def _write_readme(source: ExportSource, facts: FormatFacts, folder: Path, cfg: ExportConfig) -> None:
@@ -281,15 +294,14 @@ def _write_checksums(folder: Path) -> None:
 
 def run(cfg: ExportConfig, folder: Path, out: Path) -> Path:
     """Read a release, also of a run; write it in the format of the settings and return its folder."""
-    is_of_windows = EXPORTS[cfg.format].needs_consecutive and (cfg.frames == "all" or cfg.format == "lerobot")
-    source = check_needs(open_release(folder, f"the {cfg.format} export" if is_of_windows else ""), cfg)
+    source = check_needs(open_release(folder, f"the {cfg.format} export" if cfg.needs_consecutive else ""), cfg)
     stage = StageFolder.open(out, "export", config=cfg, inputs={"release": source.folder / RECORD}, seed=0)
     product, num_frames = out / cfg.format, source.record.numbers.frames
     if stage.is_complete:
         return product
-    format = importlib.import_module(EXPORTS[cfg.format].module)
+    writer = importlib.import_module(EXPORTS[cfg.format].module)
     with atomic_folder(product) as parts, progress_bar("export: frames", num_frames) as advance:
-        facts = format.write(source, parts, cfg, advance)
+        facts = writer.write(source, parts, cfg, advance)
         _write_readme(source, facts, parts, cfg)
         _write_checksums(parts)
     stage.finish([product / README, product / CHECKSUMS], Tally(input=num_frames, kept=num_frames))

@@ -12,15 +12,15 @@ from cosfly.runtime.escaping import cut, for_terminal
 from release.reading import TrackRows
 
 EXAMPLES = 3  # places of a kind that are named
-Words = str | Callable[[int], Any]  # of all rows alike, or of each
+Words = str | Callable[[int], Any]  # the same for all rows, or a function of the row's number
 
 
 class Kind(Issue):
-    """All findings of one code; where, got, expected: of the first one."""
+    """All findings of one code; where, got and expected are those of the first one."""
 
     model_config = ConfigDict(extra="forbid", frozen=False)
 
-    examples: list[str]
+    examples: list[str]  # the first places
 
     def __str__(self) -> str:
         times = "once" if self.count == 1 else f"{self.count:,} times"
@@ -31,9 +31,9 @@ class Kind(Issue):
 
 @dataclass
 class Findings(Report):
-    """Findings, one issue of each kind. level: Of the verification."""
+    """Findings, one issue of each kind."""
 
-    level: str = ""
+    level: str = ""  # of the verification
 
     def add(self, severity: Severity, code: str, where: object, got: object, expected: str) -> None:
         place = cut(str(where))
@@ -60,12 +60,16 @@ class Findings(Report):
             self.error(code, where, got, str(expected))
 
     def judge(self, track: TrackRows, rules: Iterable[tuple[str, str, np.ndarray, Words, Words]]) -> None:
-        """Add an error for each row that is wrong. rules: code, column, which rows are wrong (n,) bool, what was found,
-        what was expected."""
-        for code, column, wrong, *words in rules:
-            for i in np.flatnonzero(wrong).tolist():
-                got, expected = (one if isinstance(one, str) else one(i) for one in words)
-                self.error(code, track.where(i, column), got, str(expected))
+        """Add an error for each row that is wrong.
+
+        Args:
+            rules: of each rule its code, the column, which of the n rows are wrong, (n,) bool, got, and expected.
+        """
+        for code, column, is_wrong, got, expected in rules:
+            for i in np.flatnonzero(is_wrong).tolist():
+                got_here = got if isinstance(got, str) else got(i)
+                expected_here = expected if isinstance(expected, str) else expected(i)
+                self.error(code, track.where(i, column), got_here, str(expected_here))
 
     def as_json(self) -> dict[str, Any]:
         """Return what `--json` writes."""

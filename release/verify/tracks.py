@@ -1,11 +1,11 @@
-"""Check the tracks of a shard in a worker process: rows, points, captions, pictures."""
+"""Check the tracks of a shard in a worker process: rows and points; captions.py and scene.py check the rest."""
 
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
@@ -14,16 +14,18 @@ import numpy as np
 
 from cosfly.formats.captions import TOKENS
 from cosfly.formats.frames import LEGIBLE_CONTRAST, LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.places import Place, flight_ids
 from cosfly.formats.shown_captions import CaptionReader
-from cosfly.geometry.axes import BODY_FROM_CAMERA
+from cosfly.geometry.axes import BODY_FROM_CAMERA, CORNER_SIGNS
 from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.io import sha256_file
 from cosfly.runtime.worker import Item, Outcome
-from release.columns import CAPTION, LANGUAGES, POINT_NAMES, POINTS, SCALARS, WINDOW, Column
+from release.columns import POINT_NAMES, POINTS, SCALARS, Column
 from release.counting import count_track
 from release.reading import Pictures, TrackRows, read_pictures, read_tracks
 from release.record import ReleaseRecord, Shard
+from release.verify.captions import check_captions, released_track
 from release.verify.findings import Findings
 from release.verify.scene import check_pictures
 
@@ -34,22 +36,31 @@ BOX_PX = 1.0  # our person's projected box, whose corners are exact but may be c
 CENTRE_PX = 1.0  # the principal point is the picture's middle, (w - 1) / 2 in others' convention
 SQUARE = 1e-6  # square pixels: fx = fy
 STRIDE_SHARE = 0.1  # of the box's longer side: how far a figure in full stride reaches beyond it
+MASK_PX = 1.5  # and how far a mask does, whose edges lie on pixels
+EDGE_PX = 0.5  # how far a box of ours may reach beyond the picture
+HEIGHT_PX = 0.01  # of the target: rounded as its box is
+NEAR_M = 0.3  # the renderers' near plane
+ZOOMED = ("fov_deg", "intrinsics")  # columns that change if a camera zooms
+NOT_IN_POINTS = [column for column in SCALARS if column.name not in POINT_NAMES]
+LARGEST = 1e7  # of any number: farther than any town reaches, m
 
 
 def check_camera(track: TrackRows, findings: Findings) -> None:
-    """Check the camera: of the first row alone where it is constant, which `check_values` checks."""
-    is_first = np.arange(len(track)) < (len(track) if track.zooms else 1)
-    (fx, fy, cx, cy), (width, height), fovs = track.intrinsics.T, track.size_px.T, track.numbers("fov_deg")
-    fov = np.degrees(2.0 * np.arctan(width / (2.0 * fx)))
+    """Check the camera: of the first row only unless it zooms, because `check_values` checks that it is constant."""
+    is_checked = np.arange(len(track)) < (len(track) if track.zooms else 1)
+    fx, fy, cx, cy = track.intrinsics.T
+    width, height = track.size_px.T
+    fov_deg = track.numbers("fov_deg")
+    expected_deg = np.degrees(2.0 * np.arctan(width / (2.0 * fx)))
     is_middle = (np.abs(cx - width / 2) <= CENTRE_PX) & (np.abs(cy - height / 2) <= CENTRE_PX)
     is_square = (fx > 0) & (np.abs(fx - fy) <= SQUARE * fx)
     findings.judge(track, (
-        ("intrinsics", "intrinsics", is_first & ~(is_square & is_middle),
+        ("intrinsics", "intrinsics", is_checked & ~(is_square & is_middle),
          lambda i: f"focal lengths ({fx[i]}, {fy[i]}), principal point ({cx[i]}, {cy[i]})",
          lambda i: f"equal focal lengths above 0, the middle ({width[i] / 2:g}, {height[i] / 2:g})"),
-        ("field_of_view", "fov_deg", is_first & ~(np.abs(fovs - fov) <= FOV_DEG),
-         lambda i: f"{fovs[i]} degrees, focal length {fx[i]} px",
-         lambda i: f"{fov[i]:.6f} degrees, from width and focal length"),
+        ("field_of_view", "fov_deg", is_checked & ~(np.abs(fov_deg - expected_deg) <= FOV_DEG),
+         lambda i: f"{fov_deg[i]} degrees, focal length {fx[i]} px",
+         lambda i: f"{expected_deg[i]:.6f} degrees, from width and focal length"),
     ))  # fmt: skip
 
 
@@ -61,56 +72,71 @@ def check_projection(track: TrackRows, findings: Findings) -> None:
     off_px = np.hypot(track.uv[:, 0] - (fx * x / z + cx), track.uv[:, 1] - (fy * y / z + cy))
     off_px[~(z > 0)] = np.nan
     has_target, depth_m = ~np.isnan(track.target_m[:, 0]), track.numbers("target_depth_m")
-    wrong_px = has_target & ~np.isnan(track.uv[:, 0]) & ~(off_px <= PIXEL_PX)
-    wrong_m = has_target & ~np.isnan(depth_m) & ~(np.abs(depth_m - z) <= DEPTH_M)
+    is_wrong_uv = has_target & ~np.isnan(track.uv[:, 0]) & ~(off_px <= PIXEL_PX)
+    is_wrong_depth = has_target & ~np.isnan(depth_m) & ~(np.abs(depth_m - z) <= DEPTH_M)
     findings.judge(track, (
-        ("projection", "target_uv", wrong_px, lambda i: f"{off_px[i]:.3f} px from the projected target",
+        ("projection", "target_uv", is_wrong_uv, lambda i: f"{off_px[i]:.3f} px from the projected target",
          f"at most {PIXEL_PX} px"),
-        ("target_depth", "target_depth_m", wrong_m, lambda i: f"{depth_m[i]:.3f} m",
+        ("target_depth", "target_depth_m", is_wrong_depth, lambda i: f"{depth_m[i]:.3f} m",
          lambda i: f"{z[i]:.3f} m, the value from pose and target"),
     ))  # fmt: skip
+
+
+def projected_corners(track: TrackRows) -> np.ndarray:
+    """Return the corners of a person of ours at each row's target, (n, 8, 2) px; NaN if one lies behind the camera."""
+    corners = track.target_m[:, None, :] + CORNER_SIGNS * np.array(PERSON_HALF_EXTENTS_M)
+    body = np.einsum("nji,nkj->nki", track.rotations, corners - track.pose[:, None, :3])
+    x, y, z = np.moveaxis(body @ BODY_FROM_CAMERA, 2, 0)
+    fx, fy, cx, cy = (values[:, None] for values in track.intrinsics.T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uv = np.stack([fx * x / z + cx, fy * y / z + cy], axis=2)
+    uv[~(z > NEAR_M).all(axis=1)] = np.nan
+    return uv
 
 
 def check_boxes(track: TrackRows, findings: Findings) -> None:
     """Check that boxes are inside the picture, min before max; those of our renderers are the projected person's."""
     box, mask, size = track.box, track.mask_box, np.tile(track.size_px, 2)
-    is_ours, slack = not track.is_foreign, np.inf if track.is_foreign else 0.5
+    is_ours, edge_px = not track.is_foreign, np.inf if track.is_foreign else EDGE_PX
     has_box, has_mask = ~np.isnan(box[:, 0]), ~np.isnan(mask[:, 0])
-    corners = track.projected_corners
+    corners = projected_corners(track)
     expected = np.clip(np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1), 0.0, size)
-    is_other = is_ours & has_box & (np.abs(box - expected).max(axis=1) > BOX_PX)
-    slack_px = 1.5 + STRIDE_SHARE * (box[:, 2:] - box[:, :2]).max(axis=1, keepdims=True)  # a mask's edges lie on pixels
-    outside = (mask[:, :2] < box[:, :2] - slack_px).any(axis=1) | (mask[:, 2:] > box[:, 2:] + slack_px).any(axis=1)
+    is_wrong = is_ours & has_box & (np.abs(box - expected).max(axis=1) > BOX_PX)
+    around_px = MASK_PX + STRIDE_SHARE * (box[:, 2:] - box[:, :2]).max(axis=1, keepdims=True)
+    is_outside = (mask[:, :2] < box[:, :2] - around_px).any(axis=1) | (mask[:, 2:] > box[:, 2:] + around_px).any(axis=1)
 
-    def turned(one: np.ndarray) -> Any:
-        return (one[:, 2:] <= one[:, :2]).any(axis=1) | (one < -slack).any(axis=1) | (one > size + slack).any(axis=1)
+    def is_no_box(edges: np.ndarray) -> Any:
+        is_inverted = (edges[:, 2:] <= edges[:, :2]).any(axis=1)
+        return is_inverted | (edges < -edge_px).any(axis=1) | (edges > size + edge_px).any(axis=1)
 
     findings.judge(track, (("box", *rule) for rule in (
-        ("target_bbox", has_box & turned(box), lambda i: box[i].tolist(), "min before max, inside the picture"),
-        ("target_bbox", is_other, lambda i: box[i].round(1).tolist(),
+        ("target_bbox", has_box & is_no_box(box), lambda i: box[i].tolist(), "min before max, inside the picture"),
+        ("target_bbox", is_wrong, lambda i: box[i].round(1).tolist(),
          lambda i: f"{expected[i].round(1).tolist()}, the projected box of the person"),
-        ("target_mask_bbox", has_mask & turned(mask), lambda i: mask[i].tolist(), "min before max, inside the picture"),
-        ("target_mask_bbox", is_ours & has_mask & (outside | ~has_box), lambda i: mask[i].tolist(),
+        ("target_mask_bbox", has_mask & is_no_box(mask), lambda i: mask[i].tolist(),
+         "min before max, inside the picture"),
+        ("target_mask_bbox", is_ours & has_mask & (is_outside | ~has_box), lambda i: mask[i].tolist(),
          "inside target_bbox, null if that is null"),
     )))  # fmt: skip
 
 
 def check_flags(track: TrackRows, findings: Findings) -> None:
+    """Check the flags of the target against each other, its boxes, and the limits of legibility."""
     in_view, visible = track.flags("target_in_view"), track.flags("target_visible")
-    visibility = track.numbers("visibility")
     has_target = ~np.isnan(track.target_m[:, 0])
     has_box, has_mask = ~np.isnan(track.box[:, 0]), ~np.isnan(track.mask_box[:, 0])
-    legible, height_px = track.flags("target_legible"), track.numbers("target_height_px")
-    reads = visible & (height_px >= LEGIBLE_HEIGHT_PX) & (visibility >= LEGIBLE_SHARE)
-    reads &= track.numbers("target_contrast") >= LEGIBLE_CONTRAST
+    height_px = track.numbers("target_height_px")
+    is_legible = visible & (height_px >= LEGIBLE_HEIGHT_PX) & (track.visibility >= LEGIBLE_SHARE)
+    is_legible &= track.numbers("target_contrast") >= LEGIBLE_CONTRAST
+    is_wrong_legible = (track.flags("target_legible") != is_legible) & ~np.isnan(height_px)
     box_px = np.nan_to_num(track.box[:, 3] - track.box[:, 1])
     is_ours = not track.is_foreign
     findings.judge(track, (("flags", *rule) for rule in (
         ("target_visible", visible & ~in_view, "true, but target_in_view is false", "false for a target out of view"),
         ("target_in_view", in_view & ~has_target, "true, but target is null", "false without a target"),
-        ("target_legible", (legible != reads) & ~np.isnan(height_px), "a value that contradicts the limits",
+        ("target_legible", is_wrong_legible, "a value that contradicts the limits",
          "true if the target is visible and its height, contrast and visibility are large enough, else false"),
-        ("target_height_px", np.abs(height_px - box_px) > 0.01, "a different height from target_bbox",
+        ("target_height_px", np.abs(height_px - box_px) > HEIGHT_PX, "a different height from target_bbox",
          "the height of target_bbox"),
         ("target_bbox", (in_view != has_box) & is_ours, "null in view, or a box out of view",
          "a box if and only if the target is in view"),
@@ -119,22 +145,17 @@ def check_flags(track: TrackRows, findings: Findings) -> None:
     )))  # fmt: skip
 
 
-OF_ZOOM = ("fov_deg", "intrinsics")  # columns that change where a camera zooms
-FREE = [column for column in SCALARS if column.name not in POINT_NAMES]  # the others are checked in the points
-LARGEST = 1e7  # of any number: farther than any town reaches, m
-
-
 def check_values(track: TrackRows, columns: Sequence[Column], findings: Findings) -> None:
     """Check constants, nulls, closed sets and numbers of the columns of a track's rows, by the table of columns."""
     for column in columns:
         values = track.column(column.name)
         allowed: Sequence[str] = TOKENS if column.words == "actions" else column.words
-        differs = column.constant and not (track.zooms and column.name in OF_ZOOM)
+        must_be_constant = column.constant and not (track.zooms and column.name in ZOOMED)
         for i, value in enumerate(values):
-            if differs and value != values[0]:
+            if must_be_constant and value != values[0]:
                 expected = f"{values[0]}, as in the first row of the track"
                 findings.error("constant", track.where(i, column.name), value, expected)
-                differs = False
+                must_be_constant = False  # one finding is enough
             if value is None and column.required and column.of_caption is None:
                 findings.error("null", track.where(i, column.name), "null", "a value in every row")
             elif value is not None and allowed and value not in allowed:
@@ -150,11 +171,14 @@ def check_values(track: TrackRows, columns: Sequence[Column], findings: Findings
 def _check_number(
     track: TrackRows, i: int, column: Column, member: str, number: float | None, findings: Findings
 ) -> None:
-    """Check that a number of a group or column is there, finite and within its range."""
+    """Check that a number of a column, or of a member of its struct, is there, finite and within its range."""
     low, high = column.ranges.get(member, (-LARGEST, LARGEST))
-    if number is None or not low <= number <= high:  # NaN is not
-        code = "null" if number is None else "range" if math.isfinite(number) else "not_finite"
-        findings.error(code, track.where(i, f"{column.name}.{member}".rstrip(".")), number, f"{low:g} to {high:g}")
+    if number is not None and low <= number <= high:  # NaN is not
+        return
+    code = "null"
+    if number is not None:
+        code = "range" if math.isfinite(number) else "not_finite"
+    findings.error(code, track.where(i, f"{column.name}.{member}".rstrip(".")), number, f"{low:g} to {high:g}")
 
 
 def check_points(track: TrackRows, points: TrackRows, findings: Findings) -> None:
@@ -170,34 +194,10 @@ def check_points(track: TrackRows, points: TrackRows, findings: Findings) -> Non
         return
     for i, row in enumerate(track.rows):
         point = points.rows[track.index[i]] if 0 <= track.index[i] < len(points) else {}
-        for name in (name for name in POINT_NAMES if row.get(name) != point.get(name)):
-            got = f"{shown(row.get(name))}, and {shown(point.get(name))} in the table of points"
-            findings.error("points", track.where(i, name), got, "the same value in both")
-
-
-def check_captions(track: TrackRows, window_frames: int, findings: Findings) -> None:
-    """Check that captions are whole or null, their windows, and the verdict against label and decision. window_frames:
-    Of every window of the track."""
-    for i, row in enumerate(track.rows):
-        has_caption, index, decision = row["has_caption"], row["frame_index"], row["decision"]
-        odd = [
-            column.name for column in CAPTION
-            if (column.required and not row[column.name] if has_caption else row[column.name] is not None)
-        ]  # fmt: skip
-        if odd:
-            expected = f"{'a value' if has_caption else 'null'}, because has_caption is {has_caption}"
-            findings.error("caption", track.where(i, odd[0]), shown(row[odd[0]]), expected)
-        if odd or not has_caption:
-            continue
-        if row[WINDOW] != list(range(index - window_frames + 1, index + 1)) or row[WINDOW][0] < 0:
-            expected = f"{window_frames} consecutive frames up to {index}"
-            findings.error("window", track.where(i, WINDOW), row[WINDOW], expected)
-        if any(row[f"caption_{language}_flight_decision"] != decision for language in LANGUAGES):
-            findings.error("decision", track.where(i, "decision"), decision, "the same decision in all columns")
-        if (row["verdict"] == "CONSISTENT") != (decision == row["label"]):
-            got = f"{row['verdict']}, decision {decision}, label {row['label']}"
-            expected = "CONSISTENT if and only if the decision is the label"
-            findings.error("verdict", track.where(i, "verdict"), got, expected)
+        for name in POINT_NAMES:
+            if row.get(name) != point.get(name):
+                got = f"{shown(row.get(name))}, and {shown(point.get(name))} in the table of points"
+                findings.error("points", track.where(i, name), got, "the same value in both")
 
 
 # --- the worker -------------------------------------------------------------------------------------------------------
@@ -209,26 +209,29 @@ SENSELESS = (ValueError, KeyError, TypeError, IndexError, ArithmeticError, Attri
 
 @dataclass(frozen=True)
 class Context:
-    """What the checks of tracks need. reader: Recomputes labels, verdicts and values. digests: sha256 by file."""
+    """What the checks of tracks need."""
 
     folder: Path
     record: ReleaseRecord
     level: Level
-    reader: CaptionReader | None
-    digests: Mapping[str, str]
+    reader: CaptionReader | None  # recomputes labels, verdicts and values
+    digests: Mapping[str, str]  # file -> sha256
 
     @cached_property
     def ids(self) -> dict[str, str]:
-        """With what the sample ids of each track begin."""
-        places = {one.flight: Place(*one.flight.split("/")) for one in self.record.flights}
+        """The begin of the sample ids of each track, by the track's name."""
+        places = {track.flight: Place(*track.flight.split("/")) for track in self.record.flights}
         ids = flight_ids(list(places.values()))
         return {name: ids[place] for name, place in places.items()}
 
     def caption_settings(self, track: TrackRows) -> dict[str, Any]:
-        """Return the settings of a track's captions; folders above a town are part of a run's name."""
-        name = track.name.split("/")[0]
-        sources = [one for one in self.record.provenance.sources if f"{name}_".startswith(f"{one.run}_")]
-        stages = max(sources, key=lambda one: len(one.run)).stages if sources else []
+        """Return the settings of a track's captions, empty if they are not recorded.
+
+        The run in a track's name may be that of a source with the folders above the town added to it.
+        """
+        run = track.name.split("/")[0]
+        sources = [source for source in self.record.provenance.sources if f"{run}_".startswith(f"{source.run}_")]
+        stages = max(sources, key=lambda source: len(source.run)).stages if sources else []
         configs = [stage.config for stage in stages if stage.stage == "caption"]
         return configs[0] if len(configs) == 1 else {}
 
@@ -248,21 +251,23 @@ def make_worker(context: Context) -> Callable[[Item], Outcome]:
         pictures = read_pictures(context.folder, shard, files) if context.level == "pixels" else iter(())
         clean: TrackRows | None = None  # the points of the clean track before this one
         try:
-            for frames, points in read_tracks(context.folder, shard, strict=False):
-                own = replace(frames, given_id=context.ids.get(frames.name))
-                clean = points if points.is_clean else clean
-                is_twin = clean is not None and clean.name.rpartition("/")[0] == own.name.rpartition("/")[0]
-                twin = clean if is_twin and not points.is_clean else None
-                of_track = islice(pictures, len(own))
-                _check_track(own, points, twin, of_track, context, findings)
-                deque(of_track, maxlen=0)  # those that a failed check has not read
-                with _reported(own.name, findings):
-                    counts.append(count_track(own, points).model_dump())
-                    findings.compare("leak", f"{own.name}: split", own.rows[0]["split"], shard.split)
-            for name in (shard.path, shard.points.path) if context.level == "pixels" else ():
-                if name in context.digests:
-                    found = sha256_file(context.folder / name, tree=context.folder)
-                    findings.compare("checksum", name, found, context.digests[name])
+            for rows, points in read_tracks(context.folder, shard, strict=False):
+                frames = replace(rows, given_id=context.ids.get(rows.name))
+                if points.is_clean:
+                    clean, twin = points, None
+                else:  # the clean track of a trajectory goes before the perturbed one
+                    is_twin = clean is not None and clean.name.rpartition("/")[0] == points.name.rpartition("/")[0]
+                    twin = clean if is_twin else None
+                pictures_of_track = islice(pictures, len(frames))
+                _check_track(frames, points, twin, pictures_of_track, context, findings)
+                deque(pictures_of_track, maxlen=0)  # those that a failed check has not read
+                with _reported(frames.name, findings):
+                    counts.append(count_track(frames, points).model_dump())
+                    findings.compare("leak", f"{frames.name}: split", frames.rows[0]["split"], shard.split)
+            for name in (shard.path, shard.points.path):
+                if context.level == "pixels" and name in context.digests:
+                    sha256 = sha256_file(context.folder / name, tree=context.folder)
+                    findings.compare("checksum", name, sha256, context.digests[name])
         except InputError as error:
             where = str(error.where or item.item_id)
             findings.error("unreadable", where, f"{error.what}: {error.got}", "tracks that can be read")
@@ -289,18 +294,22 @@ def _check_track(
 ) -> None:  # fmt: skip
     """Run all checks of a track."""
 
-    def read_captions() -> None:
-        released = frames.shown(points, twin, context.caption_settings(frames))
-        for mismatch in context.reader(released) if context.reader else ():
-            findings.error(*mismatch)
+    def recompute_captions() -> None:
+        track = released_track(frames, points, twin, context.caption_settings(frames))
+        if context.reader is not None:
+            for mismatch in context.reader(track):
+                findings.error(*mismatch)
 
     checks: list[Callable[[], None]] = [
         lambda: check_values(points, POINTS, findings),
-        lambda: check_values(frames, FREE, findings),
-        *(partial(check, points, findings) for check in (check_camera, check_projection, check_boxes, check_flags)),
+        lambda: check_values(frames, NOT_IN_POINTS, findings),
+        lambda: check_camera(points, findings),
+        lambda: check_projection(points, findings),
+        lambda: check_boxes(points, findings),
+        lambda: check_flags(points, findings),
         lambda: check_points(frames, points, findings),
         lambda: check_captions(frames, context.window_frames(frames), findings),
-        read_captions,
+        recompute_captions,
     ]
     if context.level == "pixels":
         checks.append(lambda: check_pictures(frames, pictures, findings))
