@@ -30,6 +30,13 @@ Tensors = dict[str, Any]
 POOLED, DEEP, LISTED, PIXELS = "pooled", "deep.", "[]", "pixel_"
 
 
+class _PictureOutput(SimpleNamespace):
+    """The output of `get_image_features`, with the one method of transformers' outputs that a forward may call."""
+
+    def to_tuple(self) -> tuple:
+        return tuple(vars(self).values())
+
+
 class FramePicture(NamedTuple):
     """One picture of a sample."""
 
@@ -162,7 +169,7 @@ def with_encoded_pictures(student: Student, features: Sequence[Tensors]) -> Iter
 
     (pooled,) = (name for name in features[0] if name.startswith(POOLED))
     deep = sorted(name for name in features[0] if name.startswith(DEEP))  # in the order of the layers
-    output = SimpleNamespace(pooler_output=joined(pooled), deepstack_features=[joined(name) for name in deep])
+    output = _PictureOutput(pooler_output=joined(pooled), deepstack_features=[joined(name) for name in deep])
     further_names = features[0].keys() - {pooled, *deep}
     further = {name: torch.cat([tensors[name] for tensors in features]).to(device) for name in further_names}
     model = student.core.base_model
