@@ -90,19 +90,15 @@ class MapHeader(_Kept):
 
 @dataclass(frozen=True)
 class BoxMap:
-    """A map of boxes, the product of stages 1 and 2.
+    """A map of boxes, the product of stages 1 and 2."""
 
-    centers, half_extents: (n, 3) float64, m. rotations_deg: (n, 3) float64: pitch, yaw, roll. kinds: (n,) uint8, KINDS.
-    ids: (n,) uint64, unique and stable. meshes: Drawn instead of some boxes; none in simplified maps.
-    """
-
-    centers: np.ndarray
-    half_extents: np.ndarray
-    rotations_deg: np.ndarray
-    kinds: np.ndarray
-    ids: np.ndarray
+    centers: np.ndarray  # (n, 3) float64, m
+    half_extents: np.ndarray  # (n, 3) float64, m
+    rotations_deg: np.ndarray  # (n, 3) float64: pitch, yaw, roll
+    kinds: np.ndarray  # (n,) uint8, values of KINDS
+    ids: np.ndarray  # (n,) uint64, unique and stable
     header: MapHeader = field(default_factory=MapHeader)
-    meshes: Meshes = field(default_factory=Meshes)
+    meshes: Meshes = field(default_factory=Meshes)  # drawn instead of some boxes; none in simplified maps
 
     def __len__(self) -> int:
         return len(self.centers)
