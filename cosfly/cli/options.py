@@ -49,8 +49,8 @@ def each_run(runs: list[Path] | None) -> list[Path]:
     return folders
 
 
-def _parameter(name: str, kind: Any, option: Any, default: Any = None) -> Parameter:
-    return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option])
+def _parameter(name: str, kind: Any, option: Any) -> Parameter:
+    return Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind, option])
 
 
 class SettingOption(NamedTuple):
@@ -84,8 +84,9 @@ COMMON_OPTIONS = [  # these set no setting
     _parameter("overrides", list[str] | None, Option("--set", "-s", metavar="A.B=C", help="Set a setting; repeat it.")),
     _parameter("town", str | None, Option(help="Town of the configuration whose settings and seed are used.")),
 ]
+# Names of common options, for `command`.
 WORKERS = "workers engine address"
-STAGE = f"town seed {WORKERS}"  # common options of a stage whose items workers process
+STAGE = f"town seed {WORKERS}"  # of a stage whose items workers process
 
 
 def track_options(
@@ -135,12 +136,9 @@ class Job:
         """Return the one playback tree of --data."""
         trees = self.trees(data)
         if len(trees) > 1:
-            raise InputError(
-                "the command takes one directory of rendered tracks, but --data names several",
-                where="--data",
-                got=f"{len(trees)}: {', '.join(map(str, trees))}",
-                fix="run the command once for each directory",
-            )
+            what = "the command takes one directory of rendered tracks, but --data names several"
+            fix = "run the command once for each directory"
+            raise InputError(what, where="--data", got=f"{len(trees)}: {', '.join(map(str, trees))}", fix=fix)
         return trees[0]
 
     def trees(self, data: list[Path] | None) -> list[Path]:
@@ -286,7 +284,7 @@ def resolve(
         sections: The sections that the command uses; None for all. The others are neither loaded nor checked.
     """
     from cosfly.pipeline.command_settings import SECTIONS, CommandConfig, config_with
-    from cosfly.runtime.config import apply_overrides, build, config_file, read_yaml
+    from cosfly.runtime.config import apply_overrides, build, config_file, read_yaml, source_text
     from cosfly.runtime.json_io import dump_json
 
     assigned = list(overrides or [])
@@ -294,10 +292,7 @@ def resolve(
         # Values are read as YAML, and JSON is YAML: quoted, a colon in a text is only a colon.
         assigned.append(f"{name}={dump_json(str(value) if isinstance(value, Path) else value)}")
     file = config_file(config)
-    sources = [str(file)] if file else []
-    if assigned:
-        sources.append("--set")
-    source = " with ".join(sources)
+    source = source_text(file, bool(assigned))
     data = apply_overrides(read_yaml(file) if file else {}, assigned)
     allowed = {*CommandConfig.model_fields, *(sections or ())}
     assigned_names = {text.partition("=")[0].partition(".")[0] for text in assigned}
@@ -358,17 +353,18 @@ def print_table(
     style = style if head else {"box": None}
     table = Table(title=title, title_justify="left", show_header=bool(head), **style)
     rows = list(rows)
-    for number, name in enumerate(head):
-        is_left = number == 0 or name in left
-        # A heading breaks at spaces alone, and a number nowhere: a table may be wider than the terminal.
-        whole = [*name.split(), *(() if is_left else (str(row[number]) for row in rows))]
-        least = max(map(len, whole), default=0)
-        table.add_column(name, justify="left" if is_left else "right", overflow="fold", min_width=least)
+    for index, name in enumerate(head):
+        is_left = index == 0 or name in left
+        unbroken = name.split()  # a heading breaks at spaces alone, and a number nowhere
+        if not is_left:
+            unbroken += [str(row[index]) for row in rows]
+        min_width = max(map(len, unbroken), default=0)
+        table.add_column(name, justify="left" if is_left else "right", overflow="fold", min_width=min_width)
     for row in rows:
         table.add_row(*row)
     target = answer_console if is_answer else console
-    least = Measurement.get(target, target.options.update(max_width=1000), table).minimum
-    target.print(table, width=max(target.width, least), crop=False)
+    least_width = Measurement.get(target, target.options.update(max_width=1000), table).minimum
+    target.print(table, width=max(target.width, least_width), crop=False)  # perhaps wider than the terminal
 
 
 def print_checks(checks: Iterable[Any], title: str | None = None, *, is_answer: bool = False) -> None:

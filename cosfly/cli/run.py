@@ -80,15 +80,19 @@ def print_run(run: Path, *, with_settings: bool = False) -> None:
     for stage in summary.stages:
         seconds = "" if stage.seconds is None else f"{stage.seconds:.1f}"
         disk = size(stage.size_bytes) if stage.size_bytes else ""
-        items = str(stage.tally or "") + " so far" * (stage.state == "begun")
+        items = "" if stage.tally is None else str(stage.tally)
+        if stage.state == "begun":
+            items += " so far"
         rows.append((stage.name, stage.state, items, seconds, disk))
     total = sum(stage.size_bytes for stage in summary.stages)
     typer.echo(f"{run}: {summary.cfg.name}, {summary.progress} stages complete, {size(total)}")
     head = ("stage", "state", "items", "seconds", "on disk")
     options.print_table(head, rows, left=("state", "items"), is_answer=True, **PLAIN)
+    lines = []
     differing = changed(summary.cfg) if with_settings else []
-    lines = ["settings that differ from the defaults:"] if differing else []
-    lines += [f"  {setting.name} = {dump_json(setting.value)}" for setting in differing]
+    if differing:
+        lines.append("settings that differ from the defaults:")
+        lines += [f"  {setting.name} = {dump_json(setting.value)}" for setting in differing]
     for folder, count in summary.waiting().items():
         lines.append(f"review   {count} tracks wait for a decision: {how_to_decide(Path(os.path.relpath(folder)))}")
     if not summary.is_complete:

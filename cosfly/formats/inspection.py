@@ -234,13 +234,10 @@ def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[D
             expected = f"the folder of a track, such as {', '.join(undecided(inspected)[:3])}"
             raise InputError(what, where=inspected, got=choice.folder, expected=expected)
         if track.result == "rejected" and choice.verdict == "accepted":
-            raise InputError(
-                "the track breaks a rule of the inspection, so it cannot be accepted",
-                where=track.folder,
-                got=track.reason or "rejected",
-                expected="a track with the result `review`",
-                fix="render the track again, or change the threshold of this rule, and run the inspection again",
-            )
+            what = "the track breaks a rule of the inspection, so it cannot be accepted"
+            expected = "a track with the result `review`"
+            fix = "render the track again, or change the threshold of this rule, and run the inspection again"
+            raise InputError(what, where=track.folder, got=track.reason or "rejected", expected=expected, fix=fix)
         changes = {"folder": track.folder, "sha256": track.sha256, "inspection": digest, "by": by, "at": now}
         decisions.append(Decision(**choice.model_dump() | changes))
     with Journal(inspected.with_name(REVIEW)) as journal:

@@ -73,12 +73,9 @@ class Meshes:
         for box_id, ref in self.refs.items():
             nodes = nodes_by_file.get(ref.file, self.made)
             if ref.node is not None and ref.node not in nodes:
-                raise InputError(
-                    "the mesh file has no node of this name",
-                    where=f"box {box_id}: {ref.file}",
-                    got=ref.node[:80],
-                    expected=f"the name of a node in this file, such as {', '.join(list(nodes)[:8])}",
-                )
+                what = "the mesh file has no node of this name"
+                expected = f"the name of a node in this file, such as {', '.join(list(nodes)[:8])}"
+                raise InputError(what, where=f"box {box_id}: {ref.file}", got=ref.node[:80], expected=expected)
             if ref not in meshes:
                 mesh = np.concatenate(list(nodes.values())) if ref.node is None else nodes[ref.node]
                 meshes[ref] = self._turned(mesh, ref)

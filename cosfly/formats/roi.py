@@ -55,13 +55,8 @@ class Roi(RoiPolygon):
         }
         for name, (what, expected) in expected_values.items():
             if (got := getattr(self, name)) not in ("", expected):
-                raise InputError(
-                    what,
-                    where=f"{where}: {name}",
-                    got=got,
-                    expected=expected,
-                    fix="draw the region on this map with cosfly roi edit",
-                )
+                fix = "draw the region on this map with cosfly roi edit"
+                raise InputError(what, where=f"{where}: {name}", got=got, expected=expected, fix=fix)
 
 
 def write_roi(path: Path, roi: Roi) -> None:

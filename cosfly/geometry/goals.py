@@ -17,7 +17,7 @@ from cosfly.formats.frames import PERSON_ID
 from cosfly.formats.people import COLORS, FIGURES, GARMENTS, Appearance, Words
 
 
-class Slot(NamedTuple):
+class ClothingSlot(NamedTuple):
     """The words for a slot of clothing."""
 
     preposition: str  # "in the red coat"
@@ -35,10 +35,10 @@ class Relation(NamedTuple):
 
 
 SLOTS = {  # large garments first
-    "top": Slot("in", "穿"),
-    "legs": Slot("in", "穿"),
-    "bag": Slot("with", "背", {"en": "no bag", "zh": "不带包"}),
-    "hat": Slot("with", "戴", {"en": "no hat", "zh": "不戴帽子"}),
+    "top": ClothingSlot("in", "穿"),
+    "legs": ClothingSlot("in", "穿"),
+    "bag": ClothingSlot("with", "背", {"en": "no bag", "zh": "不带包"}),
+    "hat": ClothingSlot("with", "戴", {"en": "no hat", "zh": "不戴帽子"}),
 }
 SIDES = {
     "left": Relation({"en": "leftmost", "zh": "最左边的"}, 1.0, 0.05, is_depth=False),

@@ -157,11 +157,8 @@ class ChatClient:
         self._prompt_sizes: dict[int, deque[tuple[int, int]]] = {}  # by pictures: (tokens, characters) of the last
         self._key = os.environ.get(KEY_VARIABLE, "")
         if not (self._key.isascii() and self._key.isprintable()):  # an error of httpx would quote it
-            raise TeacherError(
-                "the API key contains a character that an HTTP header must not contain, such as a line break",
-                where=KEY_VARIABLE,
-                fix="set this environment variable to the key alone",
-            )
+            what = "the API key contains a character that an HTTP header must not contain, such as a line break"
+            raise TeacherError(what, where=KEY_VARIABLE, fix="set this environment variable to the key alone")
         self._free = [self._connect()]
         self._jitter = random.Random()  # for retry pauses only: no product depends on it
 

@@ -437,13 +437,11 @@ def _units_of(rows: list[_Row], coordinates: np.ndarray, units: Units, path: Pat
         return seen
     if seen is not None and len(coordinates) > 1 and (seen == "degrees") != (units == "degrees"):
         name = "degrees" if units == "degrees" else "metres"
-        raise InputError(
-            f"the coordinates are too {'large' if units == 'degrees' else 'small'} to be {name}",
-            where=path,
-            got=f"{coordinates.min(axis=0).tolist()} to {coordinates.max(axis=0).tolist()}",
-            expected=f"coordinates in {name}, the unit that maps.boxes.units or the file states",
-            fix=f"if the coordinates are in {seen}, pass --set maps.boxes.units={seen}",
-        )
+        what = f"the coordinates are too {'large' if units == 'degrees' else 'small'} to be {name}"
+        got = f"{coordinates.min(axis=0).tolist()} to {coordinates.max(axis=0).tolist()}"
+        expected = f"coordinates in {name}, the unit that maps.boxes.units or the file states"
+        fix = f"if the coordinates are in {seen}, pass --set maps.boxes.units={seen}"
+        raise InputError(what, where=path, got=got, expected=expected, fix=fix)
     return units
 
 

@@ -217,13 +217,9 @@ def _object_of_type(expected: str, text: bytes, where: str) -> dict[str, Any]:
     value = parse_document(text, where)
     object_type = shown(value.get("type")) if isinstance(value, dict) else json_type(value)
     if object_type != repr(expected):
-        raise InputError(
-            f"the JSON object is not a {expected} object",
-            where=f"{where}: type",
-            got=object_type,
-            expected=repr(expected),
-            fix="pass a CityJSON file, or a sequence of a CityJSON object and CityJSONFeature objects",
-        )
+        what = f"the JSON object is not a {expected} object"
+        fix = "pass a CityJSON file, or a sequence of a CityJSON object and CityJSONFeature objects"
+        raise InputError(what, where=f"{where}: type", got=object_type, expected=repr(expected), fix=fix)
     return value
 
 

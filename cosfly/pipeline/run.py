@@ -134,32 +134,23 @@ def check(cfg: RunConfig) -> None:
     for town in towns.values() or [cfg]:
         if missing := ", ".join(sorted(set(cfg.release.modalities) - set(town.render.modalities))):
             rendered = ", ".join(town.render.modalities)
-            raise ConfigError(
-                f"release.modalities contains {missing}, but the run does not render these pictures",
-                where="render.modalities",
-                got=rendered,
-                fix=f"add {missing} to render.modalities, or pass --set 'release.modalities=[{rendered}]'",
-            )
+            what = f"release.modalities contains {missing}, but the run does not render these pictures"
+            fix = f"add {missing} to render.modalities, or pass --set 'release.modalities=[{rendered}]'"
+            raise ConfigError(what, where="render.modalities", got=rendered, fix=fix)
         absent = ", ".join(sorted(set(cfg.release.tracks) - set(town.render.tracks)))
         if cfg.release.pairs == "both" and absent:
             rendered = ", ".join(town.render.tracks)
-            raise ConfigError(
-                f"release.tracks contains {absent}, but the run does not render these tracks",
-                where="render.tracks",
-                got=rendered,
-                fix=f"add {absent} to render.tracks, or pass --set 'release.tracks=[{rendered}]'",
-            )
+            what = f"release.tracks contains {absent}, but the run does not render these tracks"
+            fix = f"add {absent} to render.tracks, or pass --set 'release.tracks=[{rendered}]'"
+            raise ConfigError(what, where="render.tracks", got=rendered, fix=fix)
 
 
 def check_out(out: Path) -> None:
     """Refuse to make a run in the folder of a stage: its tree would hold a second one."""
     if (out / "stage.json").exists() and not (out / "run.yaml").exists():
-        raise ResumeError(
-            "the output directory contains the output of a single stage, not of a run",
-            where=out,
-            got="stage.json, but no run.yaml",
-            fix="choose another --out, such as the run directory above this folder",
-        )
+        what = "the output directory contains the output of a single stage, not of a run"
+        fix = "choose another --out, such as the run directory above this folder"
+        raise ResumeError(what, where=out, got="stage.json, but no run.yaml", fix=fix)
 
 
 def check_with_files(cfg: RunConfig) -> None:

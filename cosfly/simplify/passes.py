@@ -197,7 +197,7 @@ def _filled_parts(
 ) -> Iterator[np.ndarray]:  # fmt: skip
     """Halve the rows of a cluster until each part covers at least `min_fill` of the rectangle around it.
 
-    Yield the parts; single boxes are left out, because they stay as they are.
+    Yield the parts, but no single boxes, which stay as they are.
     """
     waiting = [cluster]
     while waiting:

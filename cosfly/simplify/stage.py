@@ -97,12 +97,9 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path) -> Path:
     raw = read_boxes(maps)
     result = simplify(raw, cfg)
     if len(result) == 0:
-        raise InputError(
-            "every box of the map lies below the ground",
-            where=maps,
-            expected="boxes above the ground",
-            fix="correct ground_z_m in the header of the map",
-        )
+        what = "every box of the map lies below the ground"
+        fix = "correct ground_z_m in the header of the map"
+        raise InputError(what, where=maps, expected="boxes above the ground", fix=fix)
     write_boxes(product, result)
     facts = report(raw, result)
     write_json(out / "simplify_report.json", facts)

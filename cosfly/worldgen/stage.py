@@ -65,7 +65,7 @@ class WorldConfig(Config):
     endpoint: PlannerEndpointConfig = Field(PlannerEndpointConfig(), description="requests to the language model")
 
 
-class Check(TypedDict):
+class WorldCheck(TypedDict):
     """A check of a world, as in `checks.json`."""
 
     check: str
@@ -75,12 +75,12 @@ class Check(TypedDict):
     is_met: bool
 
 
-def _check(name: str, got: float, least: float, most: float) -> Check:
+def _check(name: str, got: float, least: float, most: float) -> WorldCheck:
     is_met = bool(least - 1e-6 <= got <= most + 1e-6)
     return {"check": name, "got": round(float(got), 4), "least": least, "most": most, "is_met": is_met}
 
 
-def check_world(town: Town, plan: WorldPlan) -> list[Check]:
+def check_world(town: Town, plan: WorldPlan) -> list[WorldCheck]:
     """Compare a world with the ranges of its plan."""
     world = town.boxes
     houses = town.layout.select(of_kinds(town.layout, "Buildings"))
@@ -106,7 +106,7 @@ def check_world(town: Town, plan: WorldPlan) -> list[Check]:
     return checks
 
 
-def _problems(checks: list[Check], town: Town, trace: dict[str, Any]) -> str:
+def _problems(checks: list[WorldCheck], town: Town, trace: dict[str, Any]) -> str:
     """Return one line that names what of a prompt the world does not respect; empty where it respects all."""
     unmet = [
         f"{check['check']} ({check['got']:g}, expected {check['least']:g} to {check['most']:g})"

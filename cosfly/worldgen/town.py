@@ -317,7 +317,7 @@ class Town:
             _add_object(self._objects, thing, place, scale)
             node = f"OBJ_{thing.name.replace(' ', '_')}_{number}"
             self.object_nodes += [(node, thing.asset)] * len(thing.parts)
-            if any(part[0] == "Buildings" for part in thing.parts):
+            if any(part.kind == "Buildings" for part in thing.parts):
                 self._add_path(self._objects, place)
             self.object_nodes += [("way", None)] * (len(self._objects) - len(self.object_nodes))
             self.placed.append(Placed(thing.name, number, place.center, place.yaw_deg, scale))
@@ -406,9 +406,10 @@ class Town:
 def _add_object(boxes: BoxList, thing: Object, place: Rectangle, scale: float) -> None:
     """Add an object's boxes; the heights of its high parts are scaled like its footprint."""
     placed = boxes.framed(place.center, place.yaw_deg)
-    for kind, x, y, wide, deep, low, high in thing.parts:
-        tall = scale if high > 1.0 else 1.0
-        placed.add(kind, (scale * x, scale * y), (wide * scale, deep * scale), min(low, low * tall), high * tall)
+    for part in thing.parts:
+        tall = scale if part.high > 1.0 else 1.0
+        center, size = (scale * part.x, scale * part.y), (part.wide * scale, part.deep * scale)
+        placed.add(part.kind, center, size, min(part.low, part.low * tall), part.high * tall)
 
 
 # --- nodes of SimWorld ------------------------------------------------------------------------------------------------
