@@ -152,23 +152,15 @@ def read_track(folder: Path) -> Track:
         InputError(what, where=f"{path}: {deviation.field}", got=deviation.got, expected=deviation.expected)
         for deviation in _deviations(raw, place.variant, points, time_s, poses)
     ]
-
-    def optional(read: Callable[[], Value]) -> Value | None:
-        """Return an optional field; add its error to the issues and return None if its content is invalid."""
-        try:
-            return read()
-        except InputError as error:
-            issues.append(error)
-            return None
-
-    segments, mission = optional(lambda: read_flown(raw, len(points), str(path))) or ((), None)
-    people = goal = None
+    segments, mission = _optional(lambda: read_flown(raw, len(points), str(path)), issues) or ((), None)
+    people = None
+    goal = None
     if "people" in raw:
-        people = optional(lambda: validated(People, raw["people"], f"{path}: people"))
+        people = _optional(lambda: validated(People, raw["people"], f"{path}: people"), issues)
     if raw.get("goal") is not None and "absent" not in object_of(raw, "goal"):
-        goal = optional(lambda: read_goal(raw["goal"], len(points), f"{path}: goal"))
+        goal = _optional(lambda: read_goal(raw["goal"], len(points), f"{path}: goal"), issues)
     if {"params", "mode"} & object_of(raw, "weather").keys():  # public files may use this key otherwise
-        optional(lambda: validated(WeatherRecord, raw["weather"], f"{path}: weather"))
+        _optional(lambda: validated(WeatherRecord, raw["weather"], f"{path}: weather"), issues)
     is_original = bool(object_of(raw, "augmentation").get("is_original", place.variant == ORIGINAL))
     matrices = np.stack([_intrinsic_of(point, camera) for point in points])
     positions_m, rotations_deg = np.hsplit(mirror_poses(poses), 2)
@@ -193,6 +185,15 @@ def read_track(folder: Path) -> Track:
         goal=goal,
         bystanders=_bystanders(points),
     )
+
+
+def _optional(read: Callable[[], Value], issues: list[InputError]) -> Value | None:
+    """Return an optional field; add its error to the issues and return None if its content is invalid."""
+    try:
+        return read()
+    except InputError as error:
+        issues.append(error)
+        return None
 
 
 def _camera_of(record: _Camera, path: Path) -> Camera:

@@ -199,7 +199,8 @@ def read_body(content: bytes) -> Any:
 def _joined_events(content: bytes, reject: Callable[[str], float]) -> dict[str, Any]:
     """Return the completion whose pieces an event stream holds: some servers stream whatever the request says."""
     texts: dict[str, str] = {}
-    finish_reason = usage = None
+    finish_reason: str | None = None
+    usage: Any = None
     for line in content.split(b"\n"):  # not splitlines: a JSON string may contain other line separators
         name, _, data = line.partition(b":")
         if name != b"data" or not data.strip():

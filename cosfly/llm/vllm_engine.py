@@ -142,9 +142,10 @@ class VllmEngine:
 
     def _add_new(self, llm: Any) -> None:
         """Add new requests to vLLM; wait for one if there is nothing else to do."""
-        for number in range(min(ADDED_PER_STEP, self.cfg.batch - len(self._open))):
+        for num_added in range(min(ADDED_PER_STEP, self.cfg.batch - len(self._open))):
+            has_work = bool(self._open) or num_added > 0
             try:
-                entry = self._new.get(block=not (self._open or number))
+                entry = self._new.get(block=not has_work)
             except queue.Empty:
                 return
             if entry is None:  # the engine closes

@@ -13,7 +13,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
@@ -93,17 +93,12 @@ class TypeRule(NamedTuple):
         return is_form and fnmatchcase(column, self.column) and fnmatchcase(value, self.value)
 
 
-def _type_rules() -> list[TypeRule]:
-    """Read the rules, in order; a line of the file stands for several columns and values, separated by `|`."""
-    rules = []
-    for line in read_yaml(Path(__file__).with_name("feature_rules.yaml"))["rules"]:
-        for column in line["column"].split("|"):
-            for values, kind in line["kinds"].items():
-                rules += [TypeRule(column, value, line.get("geometry", ""), kind) for value in values.split("|")]
-    return rules
-
-
-TYPE_RULES = _type_rules()
+# A line of the file stands for several columns and values, separated by `|`.
+TYPE_RULES = [
+    TypeRule(column, value, line.get("geometry", ""), kind)
+    for line in read_yaml(Path(__file__).with_name("feature_rules.yaml"))["rules"]
+    for column in line["column"].split("|") for values, kind in line["kinds"].items() for value in values.split("|")
+]  # fmt: skip
 
 
 class BoxesConfig(Config):
@@ -173,6 +168,17 @@ class _Skipped(Exception):
         self.reason = reason
 
 
+@dataclass
+class _Made:
+    """The boxes of all rows."""
+
+    boxes: BoxList = field(default_factory=BoxList)
+    row_of_box: list[int] = field(default_factory=list)  # index of the row of each box
+    size_sources: Counter[str] = field(default_factory=Counter)  # number of boxes by the source of their sizes
+    dropped: SkippedEntries = field(default_factory=SkippedEntries)  # rows without boxes
+    repairs: list[str] = field(default_factory=list)  # places of outlines that were repaired
+
+
 class _Size(NamedTuple):
     """The size of the boxes of a row."""
 
@@ -223,48 +229,57 @@ def _read_rows(cfg: BoxesConfig, path: Path, *, is_table: bool) -> BoxMap:
     if not rows:
         raise InputError("the file has no boxes", where=path, expected="at least one row or feature with a box")
     rows = _in_metres(rows, units, path, is_table=is_table)
-    boxes = BoxList()
-    row_of_box: list[int] = []  # index of the row of each box
-    size_sources = Counter[str]()  # number of boxes by the source of their sizes
-    dropped = SkippedEntries()
-    repairs: list[str] = []  # places of outlines that were repaired
+    made = _make_boxes(rows, cfg)
+    ids = _ids_of(rows) if cfg.is_plain else []
+    _check_and_report(made, rows, ids, cfg, path)
+    header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows))
+    changes: dict[str, Any] = {"dropped_objects": dict(made.dropped.counts)} if made.dropped.counts else {}
+    if set(made.size_sources) != {"file"}:
+        changes["extent_sources"] = dict(made.size_sources)
+    box_map = made.boxes.box_map(header.model_copy(update=changes))
+    if ids and len(set(made.row_of_box)) == len(box_map):  # no row became several boxes
+        box_map = replace(box_map, ids=np.array([ids[index] for index in made.row_of_box], dtype=np.uint64))
+    return box_map
+
+
+def _make_boxes(rows: list[_Row], cfg: BoxesConfig) -> _Made:
+    """Make the boxes of all rows, in metres; a row that cannot be used is counted."""
+    made = _Made()
+    boxes = made.boxes
     for part in shapely.get_parts([row.shape for row in rows if not row.problem]):
         if isinstance(part, Polygon):
             boxes.reserve(num_cuts(part, OUTLINE_PIECE_M, np.inf, CUT_SHARES), len(part.exterior.coords))
     for index, row in enumerate(rows):
         num_before = len(boxes)
         try:
-            source = _add_row(boxes, row, cfg, repairs)
+            source = _add_row(boxes, row, cfg, made.repairs)
         except _Skipped as error:
             del boxes.rows[num_before:], boxes.kinds[num_before:]
-            dropped.add(error.reason, row.where, str(error), is_bad=error.reason != "unmapped_type")
+            made.dropped.add(error.reason, row.where, str(error), is_bad=error.reason != "unmapped_type")
         else:
-            size_sources[source] += len(boxes) - num_before
-            row_of_box += [index] * (len(boxes) - num_before)
-    ids = _ids_of(rows) if cfg.is_plain else []
+            made.size_sources[source] += len(boxes) - num_before
+            made.row_of_box += [index] * (len(boxes) - num_before)
+    return made
+
+
+def _check_and_report(made: _Made, rows: list[_Row], ids: list[int], cfg: BoxesConfig, path: Path) -> None:
+    """Raise InputError if the ids are invalid or too many rows are; log what a user may want to correct."""
+    dropped = made.dropped
     if len(set(ids)) < len(ids) or not all(0 <= box_id < 2**63 for box_id in ids):
         dropped.add("bad_id", "id", "the ids must be different whole numbers")
         dropped.num_bad += len(rows)
-    if not len(boxes):
+    if not len(made.boxes):
         dropped.num_bad += len(rows)
     expected = (
         f"at most {cfg.most_skipped:.0%} invalid rows (maps.boxes.most_skipped); columns {', '.join(COLUMNS)}; "
         f"types {', '.join(TYPES)}, or types listed in maps.boxes.types"
     )
     dropped.check(path, len(rows) - dropped.counts["unmapped_type"], cfg.most_skipped, expected)
-    if repairs:
-        log.warning("%s: %s", path.name, listed(repairs, "the outline crosses itself and is repaired"))
-    if size_sources["levels"] or size_sources["default"]:
+    if made.repairs:
+        log.warning("%s: %s", path.name, listed(made.repairs, "the outline crosses itself and is repaired"))
+    if made.size_sources["levels"] or made.size_sources["default"]:
         words = "%s: %d boxes have their size from the file, %d a height from their storeys, %d a default size"
-        log.warning(words, path.name, *(size_sources[name] for name in ("file", "levels", "default")))
-    header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows))
-    changes: dict[str, Any] = {"dropped_objects": dict(dropped.counts)} if dropped.counts else {}
-    if set(size_sources) != {"file"}:
-        changes["extent_sources"] = dict(size_sources)
-    box_map = boxes.box_map(header.model_copy(update=changes))
-    if ids and len(set(row_of_box)) == len(box_map):  # no row became several boxes
-        box_map = replace(box_map, ids=np.array([ids[index] for index in row_of_box], dtype=np.uint64))
-    return box_map
+        log.warning(words, path.name, *(made.size_sources[name] for name in ("file", "levels", "default")))
 
 
 def _ids_of(rows: Sequence[_Row]) -> list[int]:

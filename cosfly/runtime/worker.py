@@ -125,8 +125,8 @@ def work_through(connection: Connection, parent_pid: int, heartbeat_s: float, lo
     """Receive a Start, then work on items until None comes; send records, heartbeats and log lines back."""
     global _worker_index
     end_with_parent(parent_pid)
-    for number in LEFT_TO_THE_PARENT:
-        signal.signal(number, signal.SIG_IGN)
+    for signal_number in LEFT_TO_THE_PARENT:
+        signal.signal(signal_number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_THE_PARENT)
     sender = _Sender(connection)
     logging.getLogger().handlers = [sender]

@@ -215,8 +215,8 @@ def linear(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Lin
     side = 1.0 if rng.random() < 0.5 else -1.0
     for number, (a, b) in enumerate(pairwise(main)):
         foot = a + (b - a) * rng.uniform(0.35, 0.65)
-        is_both = plan.river_m or number % 3 == 2
-        for sign in (1.0, -1.0) if is_both else (side,):
+        signs = (1.0, -1.0) if plan.river_m or number % 3 == 2 else (side,)
+        for sign in signs:
             reach_m = min(depth / 2, pitch_m * rng.uniform(0.9, 1.3))
             tip = foot + np.array([rng.uniform(-0.2, 0.2) * reach_m, sign * reach_m])
             lines.append(Line(np.stack([foot, tip]), plan.street_m))

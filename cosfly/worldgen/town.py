@@ -358,9 +358,10 @@ class Town:
         centers = np.stack([x.ravel(), y.ravel()], axis=1)
         away_m = np.hypot(*(centers - np.array(turned.centroid.coords[0])).T)
         x, y = centers[np.argsort(away_m, kind="stable")].T
+        turns_deg = (0.0, 90.0) if thing.where == "open" else (0.0,)
         for scale in scales:
             wide, deep = (side * scale for side in thing.size_m)
-            for turn_deg in (0.0, 90.0) if thing.where == "open" else (0.0,):
+            for turn_deg in turns_deg:
                 half_x, half_y = (wide / 2, deep / 2) if turn_deg == 0 else (deep / 2, wide / 2)
                 outlines = shapely.box(x - half_x, y - half_y, x + half_x, y + half_y)
                 for outline in outlines[shapely.contains_properly(turned, outlines)]:
