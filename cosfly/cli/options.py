@@ -56,7 +56,7 @@ def _parameter(name: str, kind: Any, option: Any) -> Parameter:
 class SettingOption(NamedTuple):
     """An option that sets a setting."""
 
-    setting: str
+    setting: str  # with its sections, such as `plan.altitude_max_m`
     help: str
     kind: Any = str  # type of the option
     values: Mapping[str, Any] = {}  # text of the option: value of the setting; other texts are the value themselves
@@ -215,22 +215,22 @@ def command(
             `overrides`.
         options: Further options that set a setting; the function does not get them.
     """
-    listed = {"config", "overrides", *common.split()}
+    common_names = {"config", "overrides", *common.split()}
 
     def add(function: Command) -> Command:
         _, *own_parameters = signature(function, eval_str=True).parameters.values()
         own_names = [parameter.name for parameter in own_parameters]
-        added = listed - {*own_names}  # `config` is an argument of some commands
-        setting_options = options | {name: option for name, option in COMMON_SETTINGS.items() if name in added}
+        added_names = common_names - {*own_names}  # `config` is an argument of some commands
+        setting_options = options | {name: option for name, option in COMMON_SETTINGS.items() if name in added_names}
 
         @functools.wraps(function)
         def called(context: typer.Context, **values: Any) -> None:
             if context.invoked_subcommand is not None:
                 return
             settings = _set_by_options(setting_options, values)
-            used = None if sections == "*" else sections.split()
-            cfg = resolve(values["config"], values["overrides"], settings, used)
-            if "town" in listed:
+            used_sections = None if sections == "*" else sections.split()
+            cfg = resolve(values["config"], values["overrides"], settings, used_sections)
+            if "town" in common_names:
                 cfg = _town_of(cfg, values["town"])
             job = Job(cfg, settings)
             try:
@@ -238,19 +238,25 @@ def command(
             except EOFError as error:  # click would print "Aborted." alone
                 raise RuntimeError("a file or the input ends too early") from error
 
+        # Typer reads the options from the signature.
         called.__signature__ = Signature([  # type: ignore[attr-defined]
             Parameter("context", Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context),
             *(parameter.replace(kind=Parameter.KEYWORD_ONLY) for parameter in own_parameters),
             *(option.parameter(name) for name, option in setting_options.items()),
-            *(parameter for parameter in COMMON_OPTIONS if parameter.name in added),
+            *(parameter for parameter in COMMON_OPTIONS if parameter.name in added_names),
         ])  # fmt: skip
         called.__annotations__ = {}
-        group = groups.get(example.split()[1], app)
-        if group.info.invoke_without_command is True and group.registered_callback is None:
-            return group.callback(epilog=example)(called)
-        return group.command(function.__name__.replace("_", "-"), epilog=example)(called)
+        return _add_command(called, function.__name__.replace("_", "-"), example)
 
     return add
+
+
+def _add_command(called: Command, name: str, example: str) -> Command:
+    """Add a function to the group that its example names, or as the command of this group itself, or to the app."""
+    group = groups.get(example.split()[1], app)
+    if group.info.invoke_without_command is True and group.registered_callback is None:
+        return group.callback(epilog=example)(called)
+    return group.command(name, epilog=example)(called)
 
 
 def _set_by_options(options: Mapping[str, SettingOption], values: Mapping[str, Any]) -> dict[str, Any]:

@@ -125,7 +125,8 @@ def read_inspection(path: Path) -> Inspection:
     inspection = read_model(path, Inspection, INSPECT_FORMAT)
     counts = Counter(flight.folder for flight in inspection.flights)
     if repeated := [folder for folder, count in counts.items() if count > 1]:
-        what, fix = "the inspection has two records of the same track", "run the inspection again"
+        what = "the inspection has two records of the same track"
+        fix = "run the inspection again"
         raise InputError(what, where=f"{path}: flights", got=repeated[0], expected="one record for each track", fix=fix)
     return inspection
 

@@ -68,13 +68,15 @@ def read_meshes(path: Path, *, tree: Path) -> dict[str, np.ndarray]:
     data = read_bytes(path, what="mesh", tree=tree, most_mb=FILE_MB)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        what, fix = "the file type of the mesh is not supported", "export the mesh again with one of these file types"
+        what = "the file type of the mesh is not supported"
+        fix = "export the mesh again with one of these file types"
         raise InputError(what, where=path, got=path.suffix, expected=" or ".join(SUFFIXES), fix=fix)
     try:
         with np.errstate(all="ignore"):  # a chain of scales overflows; the corners are checked below
             meshes = _read_obj(data, path) if suffix == ".obj" else _read_glb(data, path)
     except NOT_READ as error:
-        got, fix = f"{type(error).__name__}: {error}"[:120], "open the file in a mesh viewer, and export the mesh again"
+        got = f"{type(error).__name__}: {error}"[:120]
+        fix = "open the file in a mesh viewer, and export the mesh again"
         raise InputError("the mesh file cannot be parsed", where=path, got=got, fix=fix) from None
     if not any(map(len, meshes.values())):
         raise InputError("the mesh has no triangles", where=path, fix="export the mesh again with its faces")
@@ -152,7 +154,9 @@ def _chunks_of(data: bytes, path: Path) -> tuple[bytes, bytes]:
         end = begin + size
         chunks.setdefault(kind, data[begin:end])
     if end > len(data):
-        got, expected, fix = f"{len(data)} bytes", f"{end} bytes", "copy or export the mesh file again"
+        got = f"{len(data)} bytes"
+        expected = f"{end} bytes"
+        fix = "copy or export the mesh file again"
         raise InputError("the mesh file is incomplete", where=path, got=got, expected=expected, fix=fix)
     return chunks[JSON_CHUNK], chunks.get(BINARY_CHUNK, b"")
 
@@ -238,7 +242,8 @@ def _check_counts(gltf: _Gltf, path: Path) -> None:
     num_bytes = [view["byteLength"] for view in gltf.views]
     if min(num_bytes, default=0) < 0 or max(num_bytes, default=0) > len(gltf.binary):
         what = "a buffer view of the mesh file declares more bytes than there are, or a negative number"
-        got, expected = f"{min(num_bytes):,} to {max(num_bytes):,} bytes", f"0 to {len(gltf.binary):,} bytes"
+        got = f"{min(num_bytes):,} to {max(num_bytes):,} bytes"
+        expected = f"0 to {len(gltf.binary):,} bytes"
         fix = "copy or export the mesh file again"
         raise InputError(what, where=path, got=got, expected=expected, fix=fix)
     num_triangles = [sum(map(gltf.num_triangles, primitives)) for primitives in gltf.primitives]
@@ -255,7 +260,8 @@ def _roots_of(gltf: _Gltf, path: Path) -> list[int]:
     else:
         roots = sorted(set(range(len(gltf.nodes))) - set(children))
     if repeated := [node for node, count in Counter([*children, *roots]).items() if count > 1]:  # also a cycle
-        what, got = "a node of the mesh file has two parents", f"node {repeated[0]}"
+        what = "a node of the mesh file has two parents"
+        got = f"node {repeated[0]}"
         raise InputError(what, where=path, got=got, expected="one parent at most", fix="export the mesh again")
     return roots
 

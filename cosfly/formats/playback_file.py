@@ -199,7 +199,8 @@ def _optional(read: Callable[[], Value], issues: list[InputError]) -> Value | No
 def _camera_of(record: _Camera, path: Path) -> Camera:
     matrix = _matrix(record.intrinsic)
     if matrix is None:
-        what, got = "the intrinsic matrix of the camera is invalid", shown(record.intrinsic)
+        what = "the intrinsic matrix of the camera is invalid"
+        got = shown(record.intrinsic)
         raise InputError(what, where=f"{path}: camera.intrinsic", got=got, expected=INTRINSIC)
     check_pixels(record.width * record.height, f"{path}: camera", f"{record.width:g} x {record.height:g} px")
     return Camera(int(record.width), int(record.height), matrix)
@@ -215,7 +216,8 @@ def _check_order(time_s: np.ndarray, path: Path) -> None:
     steps = np.diff(time_s)
     if (steps <= 0).any():
         where = f"{path}: points[{int(np.argmax(steps <= 0)) + 1}].timing.trace_timestamp"
-        what, got = "the times of the points do not increase", f"a step of {steps.min():g} s"
+        what = "the times of the points do not increase"
+        got = f"a step of {steps.min():g} s"
         raise InputError(what, where=where, got=got, expected="strictly increasing times")
 
 

@@ -104,7 +104,8 @@ class VllmEngine:
             raise EnvironmentMissing("the vLLM engine does not start", where=self.where, got=_one_line(error)) from None
 
     def _rejected(self, section: str, error: Exception) -> ConfigError:
-        what, fix = f"vLLM rejects a setting in the section {section}", "correct or remove this setting"
+        what = f"vLLM rejects a setting in the section {section}"
+        fix = "correct or remove this setting"
         return ConfigError(what, where=f"{self.settings}.{section}", got=_one_line(error), fix=fix)
 
     def arguments(self) -> dict[str, Any]:

@@ -299,7 +299,8 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> list[_Row]:
     try:
         lines = [(f"line {reader.line_num}", [cell.strip() for cell in line]) for line in reader]
     except csv.Error as error:
-        where, fix = f"{path}: line {reader.line_num}", "export the table again as CSV"
+        where = f"{path}: line {reader.line_num}"
+        fix = "export the table again as CSV"
         raise InputError("the file is not a CSV table", where=where, got=str(error), fix=fix) from None
     lines = [(where, cells) for where, cells in lines if any(cells)]
     if not lines:
@@ -330,11 +331,13 @@ def _feature_rows(cfg: BoxesConfig, path: Path) -> tuple[list[_Row], Units]:
     """Read the features of a GeoJSON file, and the unit that is set or that the file declares."""
     value = read_json(path, what="map")
     if not isinstance(value, dict) or value.get("type") not in ("FeatureCollection", "Feature", *GEOMETRIES):
-        expected, fix = f"FeatureCollection, Feature, {', '.join(GEOMETRIES)}", "export the file again as GeoJSON"
+        expected = f"FeatureCollection, Feature, {', '.join(GEOMETRIES)}"
+        fix = "export the file again as GeoJSON"
         raise InputError("the file is not GeoJSON", where=f"{path}: type", expected=f"one of {expected}", fix=fix)
     items = value.get("features") if value["type"] == "FeatureCollection" else [value]
     if not isinstance(items, list):
-        what, fix = "the FeatureCollection has no list of features", "export the file again as GeoJSON"
+        what = "the FeatureCollection has no list of features"
+        fix = "export the file again as GeoJSON"
         raise InputError(what, where=f"{path}: features", expected="a list of Feature objects", fix=fix)
     units = cfg.units
     if units == "auto":
@@ -446,7 +449,8 @@ def _units_of(rows: list[_Row], coordinates: np.ndarray, units: Units, path: Pat
         _, sizes = tree.query_nearest(points, exclusive=True, all_matches=False, return_distance=True)
     seen = seen_units(coordinates, sizes)
     if units == "auto" and seen is None:
-        what, fix = "the coordinates fit both metres and degrees", "set maps.boxes.units to `m` or to `degrees`"
+        what = "the coordinates fit both metres and degrees"
+        fix = "set maps.boxes.units to `m` or to `degrees`"
         raise InputError(what, where=path, got=f"a median size of {np.median(sizes):.3g} units", fix=fix)
     if units == "auto" and seen is not None and not (is_table and seen == "degrees"):
         return seen

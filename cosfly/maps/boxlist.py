@@ -77,7 +77,8 @@ class BoxList:
         self.num_cuts += num_cuts
         self.most_cuts += MOST_CUTS_PER_CORNER * num_corners
         if self.num_cuts > self.most_cuts:
-            got, fix = f"outlines that need {self.num_cuts:,.0f} cuts", "cut out a part of the map, or simplify it"
+            got = f"outlines that need {self.num_cuts:,.0f} cuts"
+            fix = "cut out a part of the map, or simplify it"
             raise over_limit("map", got, f"{self.most_cuts:,.0f} cuts for this number of corners", fix)
 
     def span(self, kind: str, a: Pair, b: Pair, low_m: float, high_m: float) -> None:
@@ -163,6 +164,7 @@ def with_server_ground(box_map: BoxMap, ground_z_m: float | None, is_road: np.nd
 def required(path: Path | None, setting: str) -> Path:
     """Return the path of a setting; raise ConfigError if it is not set."""
     if path is None:
-        what, fix = "the setting is required, but has no value", f"pass --set {setting}=FILE"
+        what = "the setting is required, but has no value"
+        fix = f"pass --set {setting}=FILE"
         raise ConfigError(what, where=setting, expected="the path of a file", fix=fix)
     return path

@@ -164,10 +164,11 @@ def read_model(path: Path, units: Units, most_skipped: float) -> CityModel:
             except InputError as error:
                 dropped.add("invalid", str(error.where), str(error).removeprefix(f"{error.where}: "))
     middle = np.median([item.corners().mean(axis=0) for item in objects] or [np.zeros(3)], axis=0)
-    near = [item for item in objects if (np.abs(item.corners() - middle) <= WIDEST_M).all()]
-    near_ids = {item.object_id for item in near}
+    near = []
     for item in objects:
-        if item.object_id not in near_ids:
+        if (np.abs(item.corners() - middle) <= WIDEST_M).all():
+            near.append(item)
+        else:
             dropped.add("far_away", item.object_id, "it is more than 20 km from the middle of the map")
     dropped.check(path, num_objects, most_skipped, f"at most {most_skipped:.0%} invalid or far objects")
     if not near:
@@ -312,7 +313,8 @@ def _rings(surface: _Surface, vertices: np.ndarray, where: str) -> Surface:
     """Return the rings of a surface, the outline first; raise InputError for vertices that cannot be used."""
     highest = max(map(max, surface))
     if highest >= len(vertices):
-        what, expected = "the ring refers to a vertex that does not exist", f"an index from 0 to {len(vertices) - 1}"
+        what = "the ring refers to a vertex that does not exist"
+        expected = f"an index from 0 to {len(vertices) - 1}"
         raise InputError(what, where=where, got=str(highest)[:60], expected=expected, fix=VALIDATE)
     rings = [vertices[ring] for ring in surface]
     if not all(np.isfinite(ring).all() for ring in rings):

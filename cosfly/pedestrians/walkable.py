@@ -234,7 +234,7 @@ def walkable_ground(
         footing = footing_of(box_map, grid)
     counts |= component_counts
     ground = WalkableGround(grid, inflated, parts, footing, box_map.ground_z_m, costs, is_in_roi, counts)
-    if not ground.row_ends[-1]:
+    if not ground.may_end.any():
         raise NoPathError(
             "all walkable ground is road, but pedestrian trajectories must start and end off the road", where=where,
             got=f"{counts['cells_used']} walkable cells, all Roads",

@@ -154,7 +154,8 @@ def run(cfg: RunConfig, folder: Path, out: Path, *, pedestrians: int = 20, seed:
 def _check_finished(cfg: RunConfig, folder: Path, done: Sequence[str]) -> None:
     missing = [name for name in STAGES if name not in done]
     if missing:
-        what, fix = "the run is not finished", f"finish it with cosfly run {folder}"
+        what = "the run is not finished"
+        fix = f"finish it with cosfly run {folder}"
         if cfg.towns:
             what = "the run has several towns, and its directory itself has no drone trajectories"
             fix = f"pass the directory of one town, such as {folder}/{next(iter(cfg.towns))}"

@@ -378,7 +378,8 @@ def read_checksums(folder: Path) -> dict[str, str]:
     for number, line in enumerate(read_text(path, what="checksums", tree=folder).splitlines(), 1):
         digest, _, name = line.partition("  ")
         if len(digest) != 64 or not name:
-            what, fix = "this line of the checksum file is damaged", "copy the folder again from its source"
+            what = "this line of the checksum file is damaged"
+            fix = "copy the folder again from its source"
             expected = "64 hexadecimal digits, two spaces and a file name"
             raise InputError(what, where=f"{path}:{number}", got=line[:80], expected=expected, fix=fix)
         plain = _plain_name(folder, name)

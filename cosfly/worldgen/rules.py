@@ -99,7 +99,8 @@ class _Reader:
 
     def __init__(self, prompt: str) -> None:
         if re.search(r"[\u4e00-\u9fff]", prompt):
-            what, expected = "内置规则只读英文描述", "英文描述, 例如 'a small village with a church'"
+            what = "内置规则只读英文描述"
+            expected = "英文描述, 例如 'a small village with a church'"
             fix = "用英文写这段描述, 或用 --planner URL 指定语言模型"
             raise InputError(what, where="PROMPT", got=repr(prompt[:60]), expected=expected, fix=fix)
         self.prompt = prompt

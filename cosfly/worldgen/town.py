@@ -148,8 +148,8 @@ class Town:
         self._outline = shapely.box(-size_m[0] / 2, -size_m[1] / 2, size_m[0] / 2, size_m[1] / 2)
         self.network = network(plan, size_m, rng_for(seed, "world", "streets"))
         self._strips = self._lay_streets()  # outlines of streets, from front to front
-        ground = shapely.union(shapely.union_all(self._strips), self.network.water)
-        self._blocks = shapely.difference(self._outline, ground)  # between streets and water
+        between_blocks = shapely.union(shapely.union_all(self._strips), self.network.water)
+        self._blocks = shapely.difference(self._outline, between_blocks)
         self._closed_blocks = self._find_closed_blocks()
         self._buildable = self._find_buildable()
         self.open_blocks = self._choose_open_blocks()
