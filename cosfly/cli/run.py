@@ -143,14 +143,10 @@ def config_show(
     import yaml
 
     from cosfly.pipeline import settings
-    from cosfly.runtime.config import shipped
 
-    if section is None and config is not None:
-        path = Path(config)
-        is_config = path.is_file() or (path / "run.yaml").exists() or shipped(f"{path.name}.yaml").exists()
-        is_section = config.partition(".")[0] in settings.RunConfig.model_fields  # also where a folder has this name
-        if not is_config and (is_section or not (path.exists() or path.suffix in (".yaml", ".yml"))):
-            config, section = None, config
+    if section is None and config is not None and _is_section(config):
+        section = config
+        config = None
     cfg = options.resolve(None if config is None else Path(config), overrides)
     explained = (settings.changed if changed else settings.explain)(cfg, section)
     if describe:
@@ -158,6 +154,19 @@ def config_show(
     else:
         values = settings.nested(explained)
         typer.echo(yaml.safe_dump(values, sort_keys=False, allow_unicode=True), nl=False)
+
+
+def _is_section(text: str) -> bool:
+    """Return whether the argument of `config show` names a section and not a configuration."""
+    from cosfly.pipeline.settings import RunConfig
+    from cosfly.runtime.config import shipped
+
+    path = Path(text)
+    if path.is_file() or (path / "run.yaml").exists() or shipped(f"{path.name}.yaml").exists():
+        return False
+    if text.partition(".")[0] in RunConfig.model_fields:  # also where a folder has this name
+        return True
+    return not (path.exists() or path.suffix in (".yaml", ".yml"))
 
 
 @options.app.command(epilog="cosfly doctor")

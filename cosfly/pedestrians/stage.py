@@ -7,7 +7,6 @@ straight segment behind it (0.92 instead of 1.07 m/s on the same 40 routes of a 
 
 import colorsys
 import logging
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,6 +27,7 @@ from cosfly.pedestrians.walkable import (
     CROSSING,
     ROAD,
     PedestriansConfig,
+    StepSeconds,
     WalkableGround,
     count_on_road,
     timed,
@@ -67,7 +67,7 @@ def make_pedestrian(
     path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, pace: str | None = None
 ) -> PedestrianResult:
     """Make one trajectory: draw its ends, find the route, apply a pace (None: drawn by its share), sample it."""
-    seconds = Counter[str]()
+    seconds = StepSeconds(float)
     pace_rng = rng.spawn(1)[0]  # a child takes no draw from its parent: shares of paces change no route
     route_m, num_rejected = _draw_route(path_id, ground, cfg, rng, seconds)
     with timed(seconds, "report"):  # a name in manifests, which the following of the route shares with the report
@@ -91,7 +91,7 @@ def follow_route(
 
 
 def _draw_route(
-    path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, seconds: Counter[str]
+    path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, seconds: StepSeconds
 ) -> tuple[np.ndarray, dict[str, int]]:
     """Draw pairs of ends until one is accepted; return its route, (k, 2) m, and the rejected pairs by reason."""
     limits = cfg.min_distance_m / cfg.resolution_m, cfg.max_distance_m / cfg.resolution_m
@@ -208,7 +208,7 @@ def run(
     product = out / "path.json"
     if stage.is_complete:
         return product
-    seconds = Counter[str]()
+    seconds = StepSeconds(float)
     with timed(seconds, "read"):
         box_map = read_boxes(simplified_map)
         region = read_roi(roi) if roi else None
@@ -223,7 +223,8 @@ def run(
     results = [result_of(record, _PedestrianRecord) for record in outcomes.kept]
     paths = [PedestrianTrajectory.from_json(result.path, f"{out}: items.jsonl") for result in results]
     for result in results:
-        seconds.update(result.seconds)  # type: ignore[arg-type]
+        for step, duration_s in result.seconds.items():
+            seconds[step] += duration_s
     outputs = [product, out / "pedestrians_report.json", out / "paths.png"]
     with timed(seconds, "report"):
         retries = [result.retries for result in results]

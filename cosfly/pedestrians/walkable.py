@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -50,6 +50,8 @@ FOOTING_OF_KIND = np.full(256, OPEN, dtype=np.uint8)
 FOOTING_OF_KIND[[KINDS["Sidewalks"], KINDS["Ground"]]] = PAVED
 FOOTING_OF_KIND[[KINDS["Roads"], KINDS["RailTrack"]]] = ROAD
 PAINT = KINDS["RoadLines"]
+
+StepSeconds = defaultdict[str, float]  # duration of the steps of the stage
 
 
 class PedestriansConfig(Config):
@@ -148,7 +150,8 @@ class WalkableGround:
         drawn = int(rng.integers(self.row_ends[-1]))  # in row-major order
         y = int(np.searchsorted(self.row_ends, drawn, side="right"))
         columns = np.flatnonzero(self.may_end[y])
-        return int(columns[len(columns) - (self.row_ends[y] - drawn)]), y
+        num_in_rows_above = self.row_ends[y] - len(columns)
+        return int(columns[drawn - num_in_rows_above]), y
 
     def sample_goals(
         self, start: tuple[int, int], min_cells: float, max_cells: float, rng: np.random.Generator, num: int = 1
@@ -180,16 +183,16 @@ class WalkableGround:
 
 
 @contextmanager
-def timed(seconds: Counter[str], step: str) -> Iterator[None]:
+def timed(seconds: StepSeconds, step: str) -> Iterator[None]:
     """Add the time of a block to the seconds of a step."""
     start_s = time.perf_counter()
     yield
-    seconds[step] += time.perf_counter() - start_s  # type: ignore[assignment]
+    seconds[step] += time.perf_counter() - start_s
 
 
 def walkable_ground(
     box_map: BoxMap, cfg: PedestriansConfig, roi: Roi | None = None, *, where: str | Path = "map",
-    roi_where: str | Path = "region of interest", seconds: Counter[str] | None = None,
+    roi_where: str | Path = "region of interest", seconds: StepSeconds | None = None,
 ) -> WalkableGround:  # fmt: skip
     """Return the walkable ground of a map; `where` and `roi_where` are the files to name in an error.
 
@@ -197,7 +200,7 @@ def walkable_ground(
     cuts a corner cannot pass between two cells that touch at a corner only, so an 8-connected component may hold
     several parts; both ends of a route are drawn from one part, so that it exists.
     """
-    seconds = Counter() if seconds is None else seconds
+    seconds = StepSeconds(float) if seconds is None else seconds
     with timed(seconds, "grid"):
         empty = grids.empty_grid(box_map, cfg.resolution_m)
     with timed(seconds, "project"):

@@ -3,7 +3,7 @@
 import contextlib
 import logging
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -132,17 +132,18 @@ def check(cfg: RunConfig) -> None:
     maps = [(name, town.maps.licence) for name, town in towns.items()] or [(cfg.maps.source, cfg.maps.licence)]
     choose_licence(cfg.release.licence, maps)
     for town in towns.values() or [cfg]:
-        if missing := ", ".join(sorted(set(cfg.release.modalities) - set(town.render.modalities))):
-            rendered = ", ".join(town.render.modalities)
-            what = f"release.modalities contains {missing}, but the run does not render these pictures"
-            fix = f"add {missing} to render.modalities, or pass --set 'release.modalities=[{rendered}]'"
-            raise ConfigError(what, where="render.modalities", got=rendered, fix=fix)
-        absent = ", ".join(sorted(set(cfg.release.tracks) - set(town.render.tracks)))
-        if cfg.release.pairs == "both" and absent:
-            rendered = ", ".join(town.render.tracks)
-            what = f"release.tracks contains {absent}, but the run does not render these tracks"
-            fix = f"add {absent} to render.tracks, or pass --set 'release.tracks=[{rendered}]'"
-            raise ConfigError(what, where="render.tracks", got=rendered, fix=fix)
+        _check_rendered("modalities", cfg.release.modalities, town.render.modalities, "pictures")
+        if cfg.release.pairs == "both":
+            _check_rendered("tracks", cfg.release.tracks, town.render.tracks, "tracks")
+
+
+def _check_rendered(setting: str, released: Collection[str], rendered: Collection[str], noun: str) -> None:
+    missing = ", ".join(sorted(set(released) - set(rendered)))
+    if missing:
+        got = ", ".join(rendered)
+        what = f"release.{setting} contains {missing}, but the run does not render these {noun}"
+        fix = f"add {missing} to render.{setting}, or pass --set 'release.{setting}=[{got}]'"
+        raise ConfigError(what, where=f"render.{setting}", got=got, fix=fix)
 
 
 def check_out(out: Path) -> None:
@@ -171,7 +172,7 @@ def _run_town(cfg: RunConfig, out: Path, town_stages: list[Stage]) -> list[Stage
     """Run the stages of one town."""
     with _run_directory(cfg, out):
         results = [_run_stage(stage, out, f"{k}/{len(town_stages)}") for k, stage in enumerate(town_stages, 1)]
-        viewer = out / "viewer.html"  # written after the contact sheet
+        viewer = out / "viewer.html"  # written last: current if it is newer than all manifests
         finished_ns = [(out / stage.name / "manifest.json").stat().st_mtime_ns for stage in town_stages]
         is_shown = viewer.exists() and viewer.stat().st_mtime_ns > max(finished_ns)
         if (out / "render/manifest.json").exists() and not is_shown:

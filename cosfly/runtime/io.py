@@ -317,7 +317,7 @@ def _renamed(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         for name in os.listdir(path.parent):
             owner = name.removeprefix(begin).removesuffix(end)
-            if name == f"{begin}{owner}{end}" and owner.isdecimal() and not _is_another(int(owner)):
+            if name == f"{begin}{owner}{end}" and owner.isdecimal() and not _is_other_process(int(owner)):
                 _remove(path.with_name(name))
         try:
             yield partial
@@ -328,8 +328,8 @@ def _renamed(path: Path) -> Iterator[Path]:
             raise
 
 
-def _is_another(pid: int) -> bool:
-    """Return whether another running process has this id."""
+def _is_other_process(pid: int) -> bool:
+    """Return whether another running process has this id; a file with our own id is left over from an earlier one."""
     with contextlib.suppress(PermissionError):
         try:
             os.kill(pid, 0)
