@@ -140,8 +140,8 @@ def test_a_detour_is_given_up_and_counted(monkeypatch):
         )  # fmt: skip
 
     assert worst(walks) <= 3.0 < worst(free_walks)
-    assert sum(w.retries["detour"] for w in walks) > 0
-    assert sum(w.retries["detour"] for w in free_walks) == 0
+    assert sum(w.num_rejected["detour"] for w in walks) > 0
+    assert sum(w.num_rejected["detour"] for w in free_walks) == 0
 
 
 def test_the_stage_writes_paths_report_and_picture(tmp_path):

@@ -22,8 +22,9 @@ ENDED = {130: "interrupted", 143: "terminated"}
 
 log = logging.getLogger(__name__)
 
-for name in ("run", "stages", "caption", "distill", "release"):  # these add their commands, in the order of the help
-    importlib.import_module(f"cosfly.cli.{name}")
+COMMAND_MODULES = ("run", "stages", "caption", "distill", "release")  # in the order of the help
+for module_name in COMMAND_MODULES:  # importing a module adds its commands
+    importlib.import_module(f"cosfly.cli.{module_name}")
 
 
 @app.callback(invoke_without_command=True)
@@ -51,7 +52,8 @@ def main() -> None:
     except CosflyError as error:
         _fail(str(error), 1)
     except (SystemExit, KeyboardInterrupt) as end:
-        code = end.code if isinstance(end, SystemExit) else 130  # before Typer, which catches it, has started
+        # A KeyboardInterrupt arrives here only before Typer has started, which catches it and exits with 130.
+        code = end.code if isinstance(end, SystemExit) else 130
         if code in ENDED:
             _fail(f"{ENDED[code]}; work in an output directory is kept; run the same command again to resume", code)
         _end(code)

@@ -138,4 +138,4 @@ def compare_strategies(
 
     comparisons = job.call("caption.stage.compare", job.cfg.caption, job.tree(data), out, conflicts=conflicts)
     title = f"Regeneration of the same {comparisons[0].num_conflicts} conflicts"
-    options.print_table(COLUMNS, [one.row for one in comparisons], title)
+    options.print_table(COLUMNS, [comparison.row for comparison in comparisons], title)

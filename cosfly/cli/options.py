@@ -49,14 +49,14 @@ def each_run(runs: list[Path] | None) -> list[Path]:
     return folders
 
 
-def _parameter(name: str, kind: Any, option: Any, default: Any = None) -> Parameter:
-    return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option])
+def _parameter(name: str, kind: Any, option: Any) -> Parameter:
+    return Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind, option])
 
 
 class SettingOption(NamedTuple):
     """An option that sets a setting."""
 
-    setting: str
+    setting: str  # with its sections, such as `plan.altitude_max_m`
     help: str
     kind: Any = str  # type of the option
     values: Mapping[str, Any] = {}  # text of the option: value of the setting; other texts are the value themselves
@@ -84,8 +84,9 @@ COMMON_OPTIONS = [  # these set no setting
     _parameter("overrides", list[str] | None, Option("--set", "-s", metavar="A.B=C", help="Set a setting; repeat it.")),
     _parameter("town", str | None, Option(help="Town of the configuration whose settings and seed are used.")),
 ]
+# Names of common options, for `command`.
 WORKERS = "workers engine address"
-STAGE = f"town seed {WORKERS}"  # common options of a stage whose items workers process
+STAGE = f"town seed {WORKERS}"  # of a stage whose items workers process
 
 
 def track_options(
@@ -135,12 +136,9 @@ class Job:
         """Return the one playback tree of --data."""
         trees = self.trees(data)
         if len(trees) > 1:
-            raise InputError(
-                "the command takes one directory of rendered tracks, but --data names several",
-                where="--data",
-                got=f"{len(trees)}: {', '.join(map(str, trees))}",
-                fix="run the command once for each directory",
-            )
+            what = "the command takes one directory of rendered tracks, but --data names several"
+            fix = "run the command once for each directory"
+            raise InputError(what, where="--data", got=f"{len(trees)}: {', '.join(map(str, trees))}", fix=fix)
         return trees[0]
 
     def trees(self, data: list[Path] | None) -> list[Path]:
@@ -217,22 +215,22 @@ def command(
             `overrides`.
         options: Further options that set a setting; the function does not get them.
     """
-    listed = {"config", "overrides", *common.split()}
+    common_names = {"config", "overrides", *common.split()}
 
     def add(function: Command) -> Command:
         _, *own_parameters = signature(function, eval_str=True).parameters.values()
         own_names = [parameter.name for parameter in own_parameters]
-        added = listed - {*own_names}  # `config` is an argument of some commands
-        setting_options = options | {name: option for name, option in COMMON_SETTINGS.items() if name in added}
+        added_names = common_names - {*own_names}  # `config` is an argument of some commands
+        setting_options = options | {name: option for name, option in COMMON_SETTINGS.items() if name in added_names}
 
         @functools.wraps(function)
         def called(context: typer.Context, **values: Any) -> None:
             if context.invoked_subcommand is not None:
                 return
             settings = _set_by_options(setting_options, values)
-            used = None if sections == "*" else sections.split()
-            cfg = resolve(values["config"], values["overrides"], settings, used)
-            if "town" in listed:
+            used_sections = None if sections == "*" else sections.split()
+            cfg = resolve(values["config"], values["overrides"], settings, used_sections)
+            if "town" in common_names:
                 cfg = _town_of(cfg, values["town"])
             job = Job(cfg, settings)
             try:
@@ -240,19 +238,25 @@ def command(
             except EOFError as error:  # click would print "Aborted." alone
                 raise RuntimeError("a file or the input ends too early") from error
 
+        # Typer reads the options from the signature.
         called.__signature__ = Signature([  # type: ignore[attr-defined]
             Parameter("context", Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context),
             *(parameter.replace(kind=Parameter.KEYWORD_ONLY) for parameter in own_parameters),
             *(option.parameter(name) for name, option in setting_options.items()),
-            *(parameter for parameter in COMMON_OPTIONS if parameter.name in added),
+            *(parameter for parameter in COMMON_OPTIONS if parameter.name in added_names),
         ])  # fmt: skip
         called.__annotations__ = {}
-        group = groups.get(example.split()[1], app)
-        if group.info.invoke_without_command is True and group.registered_callback is None:
-            return group.callback(epilog=example)(called)
-        return group.command(function.__name__.replace("_", "-"), epilog=example)(called)
+        return _add_command(called, function.__name__.replace("_", "-"), example)
 
     return add
+
+
+def _add_command(called: Command, name: str, example: str) -> Command:
+    """Add a function to the group that its example names, or as the command of this group itself, or to the app."""
+    group = groups.get(example.split()[1], app)
+    if group.info.invoke_without_command is True and group.registered_callback is None:
+        return group.callback(epilog=example)(called)
+    return group.command(name, epilog=example)(called)
 
 
 def _set_by_options(options: Mapping[str, SettingOption], values: Mapping[str, Any]) -> dict[str, Any]:
@@ -286,7 +290,7 @@ def resolve(
         sections: The sections that the command uses; None for all. The others are neither loaded nor checked.
     """
     from cosfly.pipeline.command_settings import SECTIONS, CommandConfig, config_with
-    from cosfly.runtime.config import apply_overrides, build, config_file, read_yaml
+    from cosfly.runtime.config import apply_overrides, build, config_file, read_yaml, source_text
     from cosfly.runtime.json_io import dump_json
 
     assigned = list(overrides or [])
@@ -294,10 +298,7 @@ def resolve(
         # Values are read as YAML, and JSON is YAML: quoted, a colon in a text is only a colon.
         assigned.append(f"{name}={dump_json(str(value) if isinstance(value, Path) else value)}")
     file = config_file(config)
-    sources = [str(file)] if file else []
-    if assigned:
-        sources.append("--set")
-    source = " with ".join(sources)
+    source = source_text(file, bool(assigned))
     data = apply_overrides(read_yaml(file) if file else {}, assigned)
     allowed = {*CommandConfig.model_fields, *(sections or ())}
     assigned_names = {text.partition("=")[0].partition(".")[0] for text in assigned}
@@ -358,18 +359,21 @@ def print_table(
     style = style if head else {"box": None}
     table = Table(title=title, title_justify="left", show_header=bool(head), **style)
     rows = list(rows)
-    for number, name in enumerate(head):
-        is_left = number == 0 or name in left
-        # Headings and names break at spaces alone, numbers nowhere: a table may be wider than the terminal.
-        cells = [str(row[number]) for row in rows]
-        names = " ".join([name, *cells] if number == 0 else [name]).split()
-        least = max(map(len, names if is_left else [*names, *cells]), default=0)
-        table.add_column(name, justify="left" if is_left else "right", overflow="fold", min_width=least)
+    for index, name in enumerate(head):
+        cells = [str(row[index]) for row in rows]
+        is_left = index == 0 or name in left
+        unbroken = name.split()  # a heading and a name break at spaces alone, and a number nowhere
+        if index == 0:
+            unbroken += " ".join(cells).split()
+        elif not is_left:
+            unbroken += cells
+        min_width = max(map(len, unbroken), default=0)
+        table.add_column(name, justify="left" if is_left else "right", overflow="fold", min_width=min_width)
     for row in rows:
         table.add_row(*row)
     target = answer_console if is_answer else console
-    least = Measurement.get(target, target.options.update(max_width=1000), table).minimum
-    target.print(table, width=max(target.width, least), crop=False)
+    least_width = Measurement.get(target, target.options.update(max_width=1000), table).minimum
+    target.print(table, width=max(target.width, least_width), crop=False)  # perhaps wider than the terminal
 
 
 def print_checks(checks: Iterable[Any], title: str | None = None, *, is_answer: bool = False) -> None:

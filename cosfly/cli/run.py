@@ -80,15 +80,19 @@ def print_run(run: Path, *, with_settings: bool = False) -> None:
     for stage in summary.stages:
         seconds = "" if stage.seconds is None else f"{stage.seconds:.1f}"
         disk = size(stage.size_bytes) if stage.size_bytes else ""
-        items = str(stage.tally or "") + " so far" * (stage.state == "begun")
+        items = "" if stage.tally is None else str(stage.tally)
+        if stage.state == "begun":
+            items += " so far"
         rows.append((stage.name, stage.state, items, seconds, disk))
     total = sum(stage.size_bytes for stage in summary.stages)
     typer.echo(f"{run}: {summary.cfg.name}, {summary.progress} stages complete, {size(total)}")
     head = ("stage", "state", "items", "seconds", "on disk")
     options.print_table(head, rows, left=("state", "items"), is_answer=True, **PLAIN)
+    lines = []
     differing = changed(summary.cfg) if with_settings else []
-    lines = ["settings that differ from the defaults:"] if differing else []
-    lines += [f"  {setting.name} = {dump_json(setting.value)}" for setting in differing]
+    if differing:
+        lines.append("settings that differ from the defaults:")
+        lines += [f"  {setting.name} = {dump_json(setting.value)}" for setting in differing]
     for folder, count in summary.waiting().items():
         lines.append(f"review   {count} tracks wait for a decision: {how_to_decide(Path(os.path.relpath(folder)))}")
     if not summary.is_complete:
@@ -139,14 +143,10 @@ def config_show(
     import yaml
 
     from cosfly.pipeline import settings
-    from cosfly.runtime.config import shipped
 
-    if section is None and config is not None:
-        path = Path(config)
-        is_config = path.is_file() or (path / "run.yaml").exists() or shipped(f"{path.name}.yaml").exists()
-        is_section = config.partition(".")[0] in settings.RunConfig.model_fields  # also where a folder has this name
-        if not is_config and (is_section or not (path.exists() or path.suffix in (".yaml", ".yml"))):
-            config, section = None, config
+    if section is None and config is not None and _is_section(config):
+        section = config
+        config = None
     cfg = options.resolve(None if config is None else Path(config), overrides)
     explained = (settings.changed if changed else settings.explain)(cfg, section)
     if describe:
@@ -154,6 +154,19 @@ def config_show(
     else:
         values = settings.nested(explained)
         typer.echo(yaml.safe_dump(values, sort_keys=False, allow_unicode=True), nl=False)
+
+
+def _is_section(text: str) -> bool:
+    """Return whether the argument of `config show` names a section and not a configuration."""
+    from cosfly.pipeline.settings import RunConfig
+    from cosfly.runtime.config import shipped
+
+    path = Path(text)
+    if path.is_file() or (path / "run.yaml").exists() or shipped(f"{path.name}.yaml").exists():
+        return False
+    if text.partition(".")[0] in RunConfig.model_fields:  # also where a folder has this name
+        return True
+    return not (path.exists() or path.suffix in (".yaml", ".yml"))
 
 
 @options.app.command(epilog="cosfly doctor")

@@ -90,19 +90,15 @@ class MapHeader(_Kept):
 
 @dataclass(frozen=True)
 class BoxMap:
-    """A map of boxes, the product of stages 1 and 2.
+    """A map of boxes, the product of stages 1 and 2."""
 
-    centers, half_extents: (n, 3) float64, m. rotations_deg: (n, 3) float64: pitch, yaw, roll. kinds: (n,) uint8, KINDS.
-    ids: (n,) uint64, unique and stable. meshes: Drawn instead of some boxes; none in simplified maps.
-    """
-
-    centers: np.ndarray
-    half_extents: np.ndarray
-    rotations_deg: np.ndarray
-    kinds: np.ndarray
-    ids: np.ndarray
+    centers: np.ndarray  # (n, 3) float64, m
+    half_extents: np.ndarray  # (n, 3) float64, m
+    rotations_deg: np.ndarray  # (n, 3) float64: pitch, yaw, roll
+    kinds: np.ndarray  # (n,) uint8, values of KINDS
+    ids: np.ndarray  # (n,) uint64, unique and stable
     header: MapHeader = field(default_factory=MapHeader)
-    meshes: Meshes = field(default_factory=Meshes)
+    meshes: Meshes = field(default_factory=Meshes)  # drawn instead of some boxes; none in simplified maps
 
     def __len__(self) -> int:
         return len(self.centers)
@@ -161,17 +157,18 @@ def make_box_map(
 
 def check_boxes(box_map: BoxMap, where: str | Path) -> None:
     """Check that numbers are finite, extents not negative, kinds known and ids unique."""
-
-    for name, least, rows in (
+    for name, least, vectors in (
         ("center", -FARTHEST_M, box_map.centers),
         ("extent", 0.0, box_map.half_extents),
         ("rotation", -FARTHEST_M, box_map.rotations_deg),
     ):
-        for row in np.flatnonzero(~((rows >= least) & (rows <= FARTHEST_M)).all(axis=1)).tolist():  # NaN too
+        is_valid = ((vectors >= least) & (vectors <= FARTHEST_M)).all(axis=1)  # NaN fails
+        if not is_valid.all():
+            row = int(np.argmin(is_valid))
             raise InputError(
                 "the box has a number that is not finite, too large or negative",
                 where=f"{where}: box {box_map.ids[row]}: {name}",
-                got=str(rows[row].tolist()),
+                got=str(vectors[row].tolist()),
                 expected=f"numbers from {least:,.0f} to {FARTHEST_M:,.0f}",
             )
     unknown = [int(kind) for kind in np.unique(box_map.kinds) if int(kind) not in KIND_NAMES]
@@ -187,13 +184,11 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
 def check_ground(box_map: BoxMap, path: Path) -> None:
     """Check that a map has ground: its height in the header, or a box of a ground kind."""
     if "ground_z_m" not in box_map.header.model_fields_set and not box_map.is_any_of(GROUND_KINDS).any():
-        raise InputError(
-            "the map has no ground",
-            where=path,
-            got="no ground_z_m in the header, and no box of a ground type",
-            expected="the height of the ground in metres",
-            fix="add ground_z_m in metres to the header, or boxes of type Roads, Sidewalks, Terrain or Ground",
-        )
+        what = "the map has no ground"
+        got = "no ground_z_m in the header, and no box of a ground type"
+        expected = "the height of the ground in metres"
+        fix = "add ground_z_m in metres to the header, or boxes of type Roads, Sidewalks, Terrain or Ground"
+        raise InputError(what, where=path, got=got, expected=expected, fix=fix)
 
 
 class _Box(BaseModel):
@@ -230,11 +225,22 @@ def write_boxes(path: Path, box_map: BoxMap) -> None:
     refs = box_map.meshes.relative_to(path.parent).refs
     # min and max follow from the rounded vectors, as they do for a reader.
     box_map = replace(box_map, **{name: np.round(getattr(box_map, name), 6) for name in VECTORS})
-    mins, maxs = box_map.mins, box_map.maxs
+    lines = []
+    for box in _records(box_map):
+        if box["id"] in refs:
+            box["mesh"] = refs[box["id"]].model_dump(exclude_none=True)
+        lines.append(dump_json(box))
+    # The header is indented; each box takes one line.
+    header = dump_json(_header_fields(box_map), indent=1).removesuffix("\n}")
+    write_bytes(path, (header + ',\n "boxes": [\n' + ",\n".join(lines) + "\n]}\n").encode())
+
+
+def _header_fields(box_map: BoxMap) -> dict[str, Any]:
+    """Return the fields of a file before the boxes."""
     low, high = box_map.bounds() if len(box_map) else (np.zeros(3), np.zeros(3))
     fields = box_map.header.model_dump(mode="json", by_alias=True, exclude_unset=True)
     last_fields: dict[str, Any] = {name: fields.pop(name) for name in ("passes", "simplify") if name in fields}
-    header: dict[str, Any] = {
+    return {
         **BOXES_FORMAT.header,
         **fields,
         "axes": AXES,
@@ -243,12 +249,16 @@ def write_boxes(path: Path, box_map: BoxMap) -> None:
         "counts": box_map.counts(),
         **last_fields,
     }
-    lines = []
-    for i, (number, box_id) in enumerate(zip(box_map.kinds.tolist(), box_map.ids.tolist(), strict=True)):
-        kind = KIND_NAMES[number]
-        box = {
+
+
+def _records(box_map: BoxMap) -> Iterator[dict[str, Any]]:
+    """Yield the boxes as in a file, without their meshes."""
+    mins, maxs = box_map.mins, box_map.maxs
+    for i, (semantic_id, box_id) in enumerate(zip(box_map.kinds.tolist(), box_map.ids.tolist(), strict=True)):
+        kind = KIND_NAMES[semantic_id]
+        yield {
             "type": kind,
-            "semantic_id": number,
+            "semantic_id": semantic_id,
             "color": KIND_COLORS[kind],
             "id": box_id,
             "center": rounded(box_map.centers[i]),
@@ -257,12 +267,6 @@ def write_boxes(path: Path, box_map: BoxMap) -> None:
             "min": rounded(mins[i]),
             "max": rounded(maxs[i]),
         }
-        if mesh := refs.get(box_id):
-            box["mesh"] = mesh.model_dump(exclude_none=True)
-        lines.append(dump_json(box))
-    # The header is indented; each box takes one line.
-    text = dump_json(header, indent=1).removesuffix("\n}") + ',\n "boxes": [\n' + ",\n".join(lines) + "\n]}\n"
-    write_bytes(path, text.encode())
 
 
 def read_boxes(path: Path) -> BoxMap:
@@ -276,15 +280,7 @@ def read_boxes(path: Path) -> BoxMap:
         value = {"boxes": value}
     else:
         check_schema(value, BOXES_FORMAT, path)
-        for name in UNIT_FIELDS & value.keys():
-            if str(value[name]).lower() not in ("m", "metre", "metres", "meter", "meters", "none"):
-                raise InputError(
-                    "the file declares another unit or coordinate system than the format boxes_3d.json has",
-                    where=f"{path}: {name}",
-                    got=value[name],
-                    expected=AXES,
-                    fix="convert the boxes to metres, z up, and remove this field",
-                )
+        _check_units(value, path)
         header = validated(MapHeader, {key: field for key, field in value.items() if key not in COMPUTED}, path)
     if "boxes" not in value:
         raise InputError(MISSING, where=f"{path}: boxes", expected="a list of boxes")
@@ -302,10 +298,12 @@ def read_boxes(path: Path) -> BoxMap:
     refs = {box.id: box.mesh for box in boxes if box.mesh is not None}
     box_map = replace(box_map, meshes=Meshes(refs, path.parent))
     check_boxes(box_map, path)
-    for where, got, expected in _mismatches(value, boxes, box_map):
+    mismatch = next(_mismatches(value, boxes, box_map), None)
+    if mismatch is not None:
+        name, got, expected = mismatch
         raise InputError(
             "the field does not match the other fields of the file",
-            where=f"{path}: {where}",
+            where=f"{path}: {name}",
             got=str(got)[:200],
             expected=str(expected)[:200],
             fix="write extent as half the size in metres, and rotation as pitch, yaw and roll in degrees; or correct "
@@ -314,8 +312,19 @@ def read_boxes(path: Path) -> BoxMap:
     return box_map
 
 
+def _check_units(value: dict[str, Any], path: Path) -> None:
+    for name in UNIT_FIELDS & value.keys():
+        if str(value[name]).lower() not in ("m", "metre", "metres", "meter", "meters", "none"):
+            what = "the file declares another unit or coordinate system than the format boxes_3d.json has"
+            fix = "convert the boxes to metres, z up, and remove this field"
+            raise InputError(what, where=f"{path}: {name}", got=value[name], expected=AXES, fix=fix)
+
+
 def _mismatches(value: dict[str, Any], boxes: list[_Box], box_map: BoxMap) -> Iterator[tuple[str, Any, Any]]:
-    """Yield where redundant fields differ from the boxes, as in a file with other axes or units: found and expected."""
+    """Yield redundant fields that differ from the boxes, as in a file with other axes or units.
+
+    Each result is the field, its value and the expected one.
+    """
     for name, computed in {"axes": AXES, "num_boxes": len(box_map), "counts": box_map.counts()}.items():
         if value.get(name, computed) != computed:
             yield name, value[name], computed

@@ -14,20 +14,17 @@ from cosfly.runtime.json_io import FileFormat
 
 BYSTANDERS_FILE = "others.json"
 BYSTANDERS_FORMAT = FileFormat("cosfly.others", "1.0", "others")
-
-
 KIND = "Pedestrians"
 PERSON_RADIUS_M = 0.3  # of the disc on the ground that covers a person
 
 
 @dataclass(frozen=True)
 class Bystander:
-    """A pedestrian next to the target. positions_m: (n, 3), on the ground below the middle. headings_rad: (n,).
-    is_look_alike: A hard distractor, which differs from the target in one garment."""
+    """A pedestrian next to the target, at n times."""
 
-    positions_m: np.ndarray
-    headings_rad: np.ndarray
-    is_look_alike: bool = False
+    positions_m: np.ndarray  # (n, 3), on the ground below the middle
+    headings_rad: np.ndarray  # (n,)
+    is_look_alike: bool = False  # a hard distractor, which differs from the target in one garment
 
     @property
     def centers_m(self) -> np.ndarray:

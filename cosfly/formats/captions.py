@@ -75,14 +75,14 @@ def verdict_on(decision: str, label: str | None, contradicted: Collection[str]) 
 
 
 class Action(NamedTuple):
-    """One action. group: Heading in tables. en: Infinitive phrase."""
+    """One action."""
 
-    group: str
-    en: str
+    group: str  # heading in tables
+    en: str  # infinitive phrase
     zh: str
 
 
-# The order of prompts, schemas and tables. Columns: group, en, zh.
+# In the order of prompts, schemas and tables.
 ACTIONS = {
     "track_straight": Action("tracking", "keep tracking straight ahead", "保持直线跟踪"),
     "yaw_left_to_follow": Action("heading", "yaw left to follow", "向左偏航跟随"),
@@ -159,39 +159,32 @@ class TeacherSettings(Record):
 
 
 class TeacherRecord(Record):
-    """The author of an answer.
-
-    structured: How the form of the answer was enforced (see Reply). run: The run of these captions, if a student
-    predicted for several trees.
-    """
+    """The author of an answer."""
 
     kind: TeacherKind
     model: str
     settings: TeacherSettings
-    structured: _Omitted[str] = None
-    run: _Omitted[str] = None
+    structured: _Omitted[str] = None  # how the form of the answer was enforced (see Reply)
+    run: _Omitted[str] = None  # the run of these captions, if a student predicted for several trees
 
 
 class JudgeRecord(Record, frozen=False):
-    """The verdict of a judge on a conflict: one of Judgement, or `unjudged`. overruled_by: geometry or text."""
+    """The verdict of a judge on a conflict."""
 
-    verdict: str
+    verdict: str  # one of Judgement, or `unjudged`
     reason: str
     model: str
-    overruled_by: _Omitted[str] = None
+    overruled_by: _Omitted[str] = None  # geometry or text
 
 
 class RepairRecord(Record, frozen=False):
-    """The regeneration of a rejected answer.
-
-    rung: The attempt that fixed it (hint, multi_sample, anchored, fix_label). outcome: repaired, failed, no_label.
-    """
+    """The regeneration of a rejected answer."""
 
     strategy: str
-    rung: str | None = None
-    outcome: str = "no_label"
-    asks: int = 0
-    first_decision: str
+    rung: str | None = None  # the attempt that fixed it: hint, multi_sample, anchored, fix_label
+    outcome: str = "no_label"  # repaired, failed, no_label
+    asks: int = 0  # number of requests
+    first_decision: str  # of the rejected answer
     first_verdict: Verdict | None
 
 
@@ -208,53 +201,38 @@ class Template(Record):
 class ValueCounts(Record):
     """The values of a caption in one language: numbers with a unit, and relations that fill slots.
 
-    values_filled: Filled from the facts, and therefore right. values_matched: Written by the teacher and equal to a
-    fact of the same unit, perhaps of another quantity. values_contradicted: Equal to none. Nothing else of the text is
-    checked.
+    Nothing else of the text is checked.
     """
 
-    values_filled: int = 0
-    values_matched: int = 0
-    values_contradicted: int = 0
+    values_filled: int = 0  # filled from the facts, and therefore right
+    values_matched: int = 0  # written by the teacher and equal to a fact of the same unit, perhaps of another quantity
+    values_contradicted: int = 0  # written by the teacher and equal to no fact
 
 
 class Evidence(Record):
-    """The evidence for the checks of a caption: the column `evidence` of a release.
+    """The evidence for the checks of a caption: the column `evidence` of a release."""
 
-    slots: Templates of the texts. contradictions: Contradicted values. contradicted: Decisions that the track
-    contradicts.
-    """
-
-    slots: _Omitted[dict[Language, Template]] = None
-    contradictions: list[str] = Field([])
-    contradicted: list[str] = Field([])
+    slots: _Omitted[dict[Language, Template]] = None  # templates of the texts
+    contradictions: list[str] = Field([])  # a message for each contradicted value
+    contradicted: list[str] = Field([])  # decisions that the track contradicts
 
 
 class Checks(Record, frozen=False):
-    """Results of the checks of a caption.
+    """Results of the checks of a caption."""
 
-    structure, bilingual: `ok` or a reason. refused: Why answers of the right structure were refused. values: Counts of
-    values by language. contradictions: A message for each contradicted value. contradicted: Decisions that the track
-    contradicts. recovered: Fixes of the text of the answers. frame: The problem of a picture.
-    refusal: The message of a server that refused the window, or the reason why it cut the answer.
-    """
-
-    structure: _Omitted[str] = None
-    refused: _Omitted[list[str]] = None
-    bilingual: _Omitted[str] = None
+    structure: _Omitted[str] = None  # `ok` or a reason
+    refused: _Omitted[list[str]] = None  # why answers of the right structure were refused
+    bilingual: _Omitted[str] = None  # `ok` or a reason
     values: _Omitted[dict[Language, ValueCounts]] = None
-    contradictions: _Omitted[list[str]] = None
-    contradicted: _Omitted[list[str]] = None
-    recovered: _Omitted[list[str]] = None
-    frame: _Omitted[str] = None
-    refusal: _Omitted[str] = None
+    contradictions: _Omitted[list[str]] = None  # as in Evidence
+    contradicted: _Omitted[list[str]] = None  # as in Evidence
+    recovered: _Omitted[list[str]] = None  # fixes of the text of the answers
+    frame: _Omitted[str] = None  # the problem of a picture
+    refusal: _Omitted[str] = None  # message of a server that refused the window, or the reason why it cut the answer
 
 
 class Caption(BaseModel):
-    """One line of `captions.jsonl`: one window, its answers and their checks.
-
-    en, zh: None without an answer of the right structure; `zh` also in English-only files.
-    """
+    """One line of `captions.jsonl`: one window, its answers and their checks."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -275,8 +253,8 @@ class Caption(BaseModel):
     attempts: int
     writing: Writing = "prose"  # how the texts were made: filled slots or prose
     therefore: str | None = None  # the decision at the end of the reasoning, before the final decision
-    en: Coc | None = None
-    zh: Coc | None = None
+    en: Coc | None = None  # None without an answer of the right structure
+    zh: Coc | None = None  # None also in English-only files
     slots: dict[Language, Template] | None = None  # the templates of the texts
     label_from: LabelFrom
     label: str | None  # ground-truth decision from the future geometry; None: undetermined

@@ -95,7 +95,8 @@ def columns(record: dict, names: Iterable[str], where: str, length: int | None =
     for name in names:
         arrays.append(column(record, name, where, len(arrays[0]) if arrays else length))
         if name in XYZ and not (np.abs(arrays[-1]) <= FARTHEST_M).all():
-            got, expected = f"{np.abs(arrays[-1]).max():g} m", f"at most {FARTHEST_M:,.0f} m"
+            got = f"{np.abs(arrays[-1]).max():g} m"
+            expected = f"at most {FARTHEST_M:,.0f} m"
             raise InputError("a place is too far from the origin", where=f"{where}.{name}", got=got, expected=expected)
     return np.stack(arrays, axis=1)
 

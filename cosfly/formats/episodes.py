@@ -1,7 +1,7 @@
-"""`episodes/<episode>.json`: the record of a closed-loop episode (`cosfly fly`), frame by frame; `score.json`: the
-score of one student, with the sums of each episode, so that folders of several maps can be merged.
+"""The results of `cosfly fly`: records of closed-loop episodes, `episodes/<episode>.json`, and `score.json`.
 
-Each frame has the visibility of the target, the student's answer to it, and the command flown from it to the next.
+The record of an episode has, for each frame, the visibility of the target, the student's answer, and the command that
+was flown from it to the next. A score has the sums of each episode, so that folders of several maps can be merged.
 World axes: right-handed, metres, degrees.
 """
 
@@ -15,70 +15,72 @@ from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
 EPISODES = "episodes"  # folder of the records
 EPISODE_FORMAT = FileFormat("cosfly.episode", "2.0", "episode")
-SCORE, SCORE_FORMAT = "score.json", FileFormat("cosfly.score", "2.0", "score")
+SCORE = "score.json"
+SCORE_FORMAT = FileFormat("cosfly.score", "2.0", "score")
 MOST_WORDS = 4000  # characters of an answer that are kept
 
-# lead: a frame of the plan, before the first decision. late: no answer within the limit. unreadable: an answer in
-# another form than requested. invalid: an unknown decision or an invalid command. none: no answer. end: the last frame,
-# without a decision. After late, unreadable, invalid and none the drone hovers.
-Answer = Literal["lead", "ok", "late", "unreadable", "invalid", "none", "end"]
-# finished: flown to the end of the pedestrian trajectory; crashed: an obstacle or the ground came within the drone's
-# radius; lost: the target was not visible for `fly.lost_s`; left: the drone flew out of the map's bounds.
-Ended = Literal["finished", "crashed", "lost", "left"]
+Answer = Literal[
+    "lead",  # a frame of the plan, before the first decision
+    "ok",
+    # After the next four the drone hovers.
+    "late",  # no answer within the limit
+    "unreadable",  # an answer in another form than requested
+    "invalid",  # an unknown decision or an invalid command
+    "none",  # no answer
+    "end",  # the last frame, without a decision
+]
+Ended = Literal[
+    "finished",  # flown to the end of the pedestrian trajectory
+    "crashed",  # an obstacle or the ground came within the drone's radius
+    "lost",  # the target was not visible for `fly.lost_s`
+    "left",  # the drone flew out of the map's bounds
+]
 
-_Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-_Least = Annotated[FiniteFloat, Field(ge=0)]
+_NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 
 
 class EpisodeFrame(Record):
-    """One frame. command: as ACTION (cosfly/geometry/motion.py), None in the last. answer_s: time of the decision.
-    words: the student's reasons, or its raw answer if unreadable.
-
-    in_view: a part of the target's box is in the picture; visible: enough of it is not hidden; visibility: the share
-    that is not hidden; num_pixels: of the target. distance_m: drone to hip over ground; height_m: drone over the
-    target's ground; clearance_m: least distance to an obstacle or the ground until the next frame; speed_mps: of the
-    drone. pose: x, y, z, pitch, yaw, roll of the camera. target_m: the hip.
-    """
+    """One frame."""
 
     time_s: FiniteFloat
     answer: Answer
     action: str | None = None
+    # As ACTION (cosfly/geometry/motion.py); None in the last frame.
     command: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] | None = None
-    answer_s: _Least | None = None
-    words: str | None = Field(None, max_length=MOST_WORDS)
-    in_view: bool
-    visible: bool
-    visibility: Annotated[FiniteFloat, Field(ge=0, le=1)]
-    num_pixels: NonNegativeInt
-    distance_m: _Least
-    height_m: FiniteFloat
-    clearance_m: FiniteFloat
-    speed_mps: _Least
+    answer_s: _NotNegative | None = None  # time of the decision
+    words: str | None = Field(None, max_length=MOST_WORDS)  # the student's reasons, or its raw answer if unreadable
+    in_view: bool  # a part of the target's box is in the picture
+    visible: bool  # enough of it is not hidden
+    visibility: Annotated[FiniteFloat, Field(ge=0, le=1)]  # the share that is not hidden
+    num_pixels: NonNegativeInt  # of the target
+    distance_m: _NotNegative  # from the drone to the target's hip, over ground
+    height_m: FiniteFloat  # of the drone over the target's ground
+    clearance_m: FiniteFloat  # least distance to an obstacle or the ground until the next frame
+    speed_mps: _NotNegative  # of the drone
+    # x, y, z, pitch, yaw, roll of the camera.
     pose: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
-    target_m: _Triple
+    target_m: tuple[FiniteFloat, FiniteFloat, FiniteFloat]  # the hip
 
 
 class Episode(Record):
-    """The record of an episode. episode: its id, unique in a folder. walk: the pedestrian trajectory. list_sha256:
-    of the benchmark's list, None for own trajectories. controller_sha256: of the table of commands, None if the student
-    returns commands. num_walk_frames: frames after the lead frames in the whole trajectory; an early end has fewer."""
+    """The record of an episode."""
 
-    episode: str = Field(min_length=1)
+    episode: str = Field(min_length=1)  # its id, unique in a folder
     student: str
     engine: str
     town: str
     map_sha256: str
-    walk: str
+    walk: str  # id of the pedestrian trajectory
     seed: int
     pace: str  # of the pedestrian
     dt_s: Annotated[FiniteFloat, Field(gt=0)]
     camera_px: tuple[int, int]
     fov_deg: Annotated[FiniteFloat, Field(gt=0, lt=180)]
-    drone_radius_m: _Least
-    list_sha256: str | None = None
-    controller_sha256: str | None = None
+    drone_radius_m: _NotNegative
+    list_sha256: str | None = None  # of the benchmark's list; None for own trajectories
+    controller_sha256: str | None = None  # of the table of commands; None if the student returns commands
     ended: Ended
-    num_walk_frames: int = Field(ge=1)
+    num_walk_frames: int = Field(ge=1)  # after the lead, in the whole trajectory; an early end has fewer
     frames: tuple[EpisodeFrame, ...] = Field(min_length=2)
 
     @property
@@ -124,33 +126,33 @@ class Figure(Record):
         """Return the figure as text, `62.0% (58.1% to 65.3%)` for the format `.1%`, without an interval of width 0."""
         if self.value is None:
             return "-"
-        is_wide = self.low is not None and self.high is not None and self.low < self.high
-        return f"{self.value:{digits}}" + (f" ({self.low:{digits}} to {self.high:{digits}})" if is_wide else "")
+        text = f"{self.value:{digits}}"
+        if self.low is None or self.high is None or self.low >= self.high:
+            return text
+        return f"{text} ({self.low:{digits}} to {self.high:{digits}})"
 
 
 class EpisodeScore(Record):
-    """The measures of one episode. answers: counts of the student's
-    answers. sums: figure -> numerator and denominator."""
+    """The measures of one episode."""
 
     episode: str
     town: str
     walk: str  # map and trajectory: episodes of one are correlated
     ended: Ended
-    answers: dict[Answer, NonNegativeInt]
-    sums: dict[str, tuple[FiniteFloat, _Least]]
+    answers: dict[Answer, NonNegativeInt]  # counts
+    sums: dict[str, tuple[FiniteFloat, _NotNegative]]  # figure -> numerator and denominator
 
 
 class Score(Record):
-    """The score of one student. episodes_sha256: of the tasks; only equal ones are comparable. list_sha256: of the
-    published list, None for own trajectories. figures: by measures.MEASURES."""
+    """The score of one student."""
 
     student: str = Field(min_length=1)
     engine: str
-    episodes_sha256: str
-    list_sha256: str | None = None
+    episodes_sha256: str  # of the tasks; only scores with equal ones are comparable
+    list_sha256: str | None = None  # of the published list; None for own trajectories
     confidence: Annotated[FiniteFloat, Field(gt=0, lt=1)]
     resamples: int = Field(ge=1)
-    figures: dict[str, Figure]
+    figures: dict[str, Figure]  # by measures.MEASURES
     flights: tuple[EpisodeScore, ...] = Field(min_length=1)
 
     @model_validator(mode="after")

@@ -60,11 +60,11 @@ COORDINATES = {
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera with square pixels; `intrinsic` is (3, 3), px."""
+    """A pinhole camera with square pixels."""
 
     width_px: int
     height_px: int
-    intrinsic: np.ndarray
+    intrinsic: np.ndarray  # (3, 3), px
 
     @property
     def focal_px(self) -> float:
@@ -141,15 +141,15 @@ def tree_yaw(yaw_deg: float) -> float:
 
 
 class CameraMeta(Record):
-    """The camera of a frame. intrinsic: 3 x 3, px. near_m, far_m: Clip planes."""
+    """The camera of a frame."""
 
     width: int
     height: int
     fov_deg: float
     focal_length_px: float
     focal_length_35mm_mm: float | None = None  # null in older trees
-    intrinsic: list[list[float]]
-    near_m: float
+    intrinsic: list[list[float]]  # 3 x 3, px
+    near_m: float  # clip planes
     far_m: float
 
 
@@ -166,13 +166,14 @@ def camera_meta(camera: Camera, near_m: float, far_m: float) -> CameraMeta:
 
 
 class TargetMeta(Record):
-    """The target in a frame: its hip, box and visibility. Picture coordinates are px, null if it is not in view."""
+    """The target in a frame: its hip, box and visibility."""
 
-    world_location: Position
+    world_location: Position  # of the hip
     half_extents_m: tuple[float, float, float]
     instance_id: int
     semantic_id: int
-    image_uv: list[float] | None
+    # Picture coordinates are px, null if the target is not in view.
+    image_uv: list[float] | None  # of the hip
     bbox_2d: list[float] | None  # of its projected 3D box
     mask_bbox_2d: list[float] | None = None  # of its pixels; absent in older trees
     depth_m: float
@@ -187,22 +188,22 @@ class TargetMeta(Record):
 
 
 class PerturbationMeta(Record):
-    """The outcome of each perturbation event of a frame (none, applied, fallback: reason), and the offsets."""
+    """The perturbation of a frame."""
 
-    position: str
-    rotation: str
-    drone_position: Position
+    position: str  # outcome of the event: none, applied, or fallback: reason
+    rotation: str  # outcome of the event
+    drone_position: Position  # offsets
     target_position: Position
     drone_rotation: Angles
 
 
 class BystanderMeta(Record):
-    """A bystander: centre of its box, heading in degrees clockwise from east, and number of its pixels."""
+    """A bystander in a frame."""
 
     instance_id: int
     semantic_id: int
-    world_location: Position
-    yaw: float
+    world_location: Position  # of the centre of its box
+    yaw: float  # heading, degrees clockwise from east
     half_extents_m: tuple[float, float, float]
     num_pixels: int
 
@@ -226,12 +227,14 @@ class BystandersMeta(Record):
         instance id. alike_id, alike_differences: The one that looks most like the target, and the number of
         differences; None without `people`. All but the first are None if nobody is in view.
         """
-        visible = [body for body in self.others if body.semantic_id == KINDS["Pedestrians"] and body.num_pixels]
-        distances_m = {body.instance_id: float(np.hypot(*(body.world_location - target_m)[:2])) for body in visible}
+        distances_m: dict[int, float] = {}  # by instance id
+        for body in self.others:
+            if body.semantic_id == KINDS["Pedestrians"] and body.num_pixels:
+                distances_m[body.instance_id] = float(np.hypot(*(body.world_location - target_m)[:2]))
         nearest_id = min(distances_m, key=distances_m.__getitem__, default=None)
         alike_id, alike_differences = (None, None) if people is None else people.most_alike(distances_m)
         return {
-            "in_view": len(visible),
+            "in_view": len(distances_m),
             "nearest_m": None if nearest_id is None else round(distances_m[nearest_id], 3),
             "nearest_id": nearest_id,
             "alike_id": alike_id,
@@ -240,7 +243,7 @@ class BystandersMeta(Record):
 
 
 class FrameMeta(Record):
-    """`meta.json`: all that a loader needs of one frame. drone_pose: (6,) x, y, z, pitch, yaw, roll of the camera."""
+    """`meta.json`: all that a loader needs of one frame."""
 
     coordinates: dict[str, str] = COORDINATES
     index: int
@@ -249,7 +252,7 @@ class FrameMeta(Record):
     trajectory: str
     variant: str
     camera: CameraMeta
-    drone_pose: Pose
+    drone_pose: Pose  # of the camera
     target: TargetMeta
     perturbation: PerturbationMeta
     look: Look | None = None  # null with weather, and in older trees

@@ -1,5 +1,4 @@
-"""`inspect.json`, the product of step 6: one record per track and the funnel; `review.jsonl` next to it: decisions of
-people on tracks that the inspection left in review (`cosfly inspect review`).
+"""`inspect.json`, the product of step 6, and `review.jsonl`, the decisions of people on tracks in review.
 
 `review.jsonl` only grows: a later decision on the same track replaces an earlier one. Each decision names the
 inspection by the digest of its file and counts for that inspection only.
@@ -31,19 +30,18 @@ RESULTS: tuple[Result, ...] = ("accepted", "review", "rejected")
 
 
 class TrackInspection(Record):
-    """The result of one track. folder: relative to the playback tree. sha256: of its files (`digest_of`). Metrics are
-    None where unknown."""
+    """The result of one track."""
 
     town: str
     trajectory: str
     variant: str
     is_original: bool | None = None  # None in older inspections and for unreadable tracks
-    folder: str
-    sha256: str | None = None  # None in older inspections and for unreadable tracks
+    folder: str  # relative to the playback tree
+    sha256: str | None = None  # of its files (`digest_of`); None in older inspections and for unreadable tracks
     trace_id: str | None
     result: Result
-    issues: list[Issue]
-    metrics: dict[str, FiniteFloat | int | None]
+    issues: list[Issue]  # the worst first
+    metrics: dict[str, FiniteFloat | int | None]  # None where unknown
     # By a person, after the inspection; `inspect.json` never holds it.
     decided: Literal["accepted", "rejected"] | None = Field(None, exclude=True)
 
@@ -108,13 +106,13 @@ def count_trajectories(flights: list[TrackInspection], *, planned: bool) -> dict
 
     planned: True counts planned trajectories and ignores tracks without one; False counts folders.
     """
-    results: dict[str, set[Result]] = {}
+    worst: dict[str, Result] = {}  # by trajectory
     for flight in flights:
         name = flight.trace_id if planned else str(Path(flight.folder).parent)
         if name is not None:
-            results.setdefault(name, set()).add(flight.result)
-    worst = Counter(max(of_trajectory, key=RESULTS.index) for of_trajectory in results.values())
-    return {"rendered": len(results)} | {result: worst[result] for result in RESULTS}
+            worst[name] = max(worst.get(name, RESULTS[0]), flight.result, key=RESULTS.index)
+    counts = Counter(worst.values())
+    return {"rendered": len(worst)} | {result: counts[result] for result in RESULTS}
 
 
 def write_inspection(path: Path, inspection: Inspection) -> None:
@@ -127,7 +125,8 @@ def read_inspection(path: Path) -> Inspection:
     inspection = read_model(path, Inspection, INSPECT_FORMAT)
     counts = Counter(flight.folder for flight in inspection.flights)
     if repeated := [folder for folder, count in counts.items() if count > 1]:
-        what, fix = "the inspection has two records of the same track", "run the inspection again"
+        what = "the inspection has two records of the same track"
+        fix = "run the inspection again"
         raise InputError(what, where=f"{path}: flights", got=repeated[0], expected="one record for each track", fix=fix)
     return inspection
 
@@ -136,39 +135,41 @@ def read_inspection(path: Path) -> Inspection:
 
 
 class Choice(Record):
-    """A person's verdict. folder: Of a track, relative to the playback tree."""
+    """A person's verdict on a track."""
 
-    folder: str
+    folder: str  # relative to the playback tree
     verdict: Literal["accepted", "rejected"]
     reason: str = Field(min_length=1, max_length=2000)
 
 
 class Decision(Choice):
-    """A line of `review.jsonl`. inspection: sha256 of `inspect.json`; sha256: of the track's files as recorded there;
-    at: UTC, ISO 8601."""
+    """A line of `review.jsonl`."""
 
-    inspection: str
-    sha256: str | None
+    inspection: str  # sha256 of `inspect.json`
+    sha256: str | None  # of the track's files, as recorded there
     by: str = Field(min_length=1, max_length=200)
-    at: str
+    at: str  # UTC, ISO 8601
+
+
+# In the following functions `inspected` is the path of an `inspect.json`.
 
 
 def read_decisions(inspected: Path) -> dict[str, Decision]:
-    """Read the last decision on each track, by folder; empty without a file. inspected: path of `inspect.json`."""
+    """Read the last decision on each track, by folder; empty without a file."""
     path = inspected.with_name(REVIEW)
     digest = sha256_file(inspected)
     journal = Journal(path)
     decisions: dict[str, Decision] = {}
     for decision in journal.read_as(Decision.model_validate):
         if decision.inspection != digest:
-            found = f"for the version with sha256 {decision.inspection[:12]}"
-            again = f"move {REVIEW} away and decide again with cosfly inspect review"
+            text = f"{decision.verdict} {decision.folder} by {decision.by} at {decision.at}"
             raise InputError(
                 f"the review decision was made for a different version of `{inspected.name}`",
                 where=f"{path}:{journal.line_num}",
-                got=f"{decision.verdict} {decision.folder} by {decision.by} at {decision.at}, {found}",
+                got=f"{text}, for the version with sha256 {decision.inspection[:12]}",
                 expected=f"a decision for {inspected} with sha256 {digest[:12]}",
-                fix=f"{again}; or restore the `{inspected.name}` that was reviewed",
+                fix=f"move {REVIEW} away and decide again with cosfly inspect review; or restore the "
+                f"`{inspected.name}` that was reviewed",
             )
         decisions[decision.folder] = decision
     if journal.num_damaged:
@@ -191,9 +192,9 @@ def how_to_decide(folder: Path) -> str:
 
 def summary(inspected: Path) -> str:
     """Return the state of the review in one line, with the names of open tracks."""
-    before, after = read_inspection(inspected).flights, read_settled(inspected).flights
-    now = {track.folder: track.result for track in after}
-    counts = Counter(now[track.folder] for track in before if track.result == "review")
+    settled = {track.folder: track.result for track in read_settled(inspected).flights}
+    in_review = [track.folder for track in read_inspection(inspected).flights if track.result == "review"]
+    counts = Counter(settled[folder] for folder in in_review)
     waiting = undecided(inspected)
     text = f"{counts.total()} tracks in review: {counts['accepted']} accepted, {counts['rejected']} rejected"
     names = f" ({', '.join(waiting[:3])}{', ...' if len(waiting) > 3 else ''})" if waiting else ""
@@ -206,9 +207,12 @@ def read_settled(inspected: Path) -> Inspection:
     decisions = read_decisions(inspected)
     if not decisions:
         return inspection
-    verdicts = {folder: decision.verdict for folder, decision in decisions.items()}
-    updates = {folder: {"result": verdict, "decided": verdict} for folder, verdict in verdicts.items()}
-    tracks = [track.model_copy(update=updates.get(track.folder)) for track in inspection.flights]
+    tracks = []
+    for track in inspection.flights:
+        if track.folder in decisions:
+            verdict = decisions[track.folder].verdict
+            track = track.model_copy(update={"result": verdict, "decided": verdict})
+        tracks.append(track)
     is_planned = any(track.trace_id is not None for track in tracks) or not inspection.funnel.trajectories.rendered
     counts = count_trajectories(tracks, planned=is_planned)
     trajectories = inspection.funnel.trajectories.model_copy(update=counts)
@@ -231,15 +235,12 @@ def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[D
             expected = f"the folder of a track, such as {', '.join(undecided(inspected)[:3])}"
             raise InputError(what, where=inspected, got=choice.folder, expected=expected)
         if track.result == "rejected" and choice.verdict == "accepted":
-            raise InputError(
-                "the track breaks a rule of the inspection, so it cannot be accepted",
-                where=track.folder,
-                got=track.reason or "rejected",
-                expected="a track with the result `review`",
-                fix="render the track again, or change the threshold of this rule, and run the inspection again",
-            )
-        file = {"folder": track.folder, "sha256": track.sha256, "inspection": digest}
-        decisions.append(Decision(**file, verdict=choice.verdict, reason=choice.reason, by=by, at=now))
+            what = "the track breaks a rule of the inspection, so it cannot be accepted"
+            expected = "a track with the result `review`"
+            fix = "render the track again, or change the threshold of this rule, and run the inspection again"
+            raise InputError(what, where=track.folder, got=track.reason or "rejected", expected=expected, fix=fix)
+        changes = {"folder": track.folder, "sha256": track.sha256, "inspection": digest, "by": by, "at": now}
+        decisions.append(Decision(**choice.model_dump() | changes))
     with Journal(inspected.with_name(REVIEW)) as journal:
         for decision in decisions:
             journal.append(decision.model_dump())

@@ -10,6 +10,7 @@ import logging
 import re
 import struct
 from collections import Counter
+from collections.abc import Iterator
 from functools import cache
 from itertools import chain, pairwise
 from pathlib import Path
@@ -31,7 +32,7 @@ Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 # Numbers of glTF.
 GLB_MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
-GLB_HEADER_BYTES = 12
+GLB_HEADER_BYTES, CHUNK_HEADER_BYTES = 12, 8
 TRIANGLES = 4  # mode of a primitive; smaller ones are points and lines, larger ones strips and fans
 FLOAT, ARRAY_BUFFER = 5126, 34962
 DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", FLOAT: "<f4"}  # by component type
@@ -67,13 +68,15 @@ def read_meshes(path: Path, *, tree: Path) -> dict[str, np.ndarray]:
     data = read_bytes(path, what="mesh", tree=tree, most_mb=FILE_MB)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        what, fix = "the file type of the mesh is not supported", "export the mesh again with one of these file types"
+        what = "the file type of the mesh is not supported"
+        fix = "export the mesh again with one of these file types"
         raise InputError(what, where=path, got=path.suffix, expected=" or ".join(SUFFIXES), fix=fix)
     try:
         with np.errstate(all="ignore"):  # a chain of scales overflows; the corners are checked below
             meshes = _read_obj(data, path) if suffix == ".obj" else _read_glb(data, path)
     except NOT_READ as error:
-        got, fix = f"{type(error).__name__}: {error}"[:120], "open the file in a mesh viewer, and export the mesh again"
+        got = f"{type(error).__name__}: {error}"[:120]
+        fix = "open the file in a mesh viewer, and export the mesh again"
         raise InputError("the mesh file cannot be parsed", where=path, got=got, fix=fix) from None
     if not any(map(len, meshes.values())):
         raise InputError("the mesh has no triangles", where=path, fix="export the mesh again with its faces")
@@ -97,10 +100,14 @@ def _read_obj(data: bytes, path: Path) -> dict[str, np.ndarray]:
     text = data.decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
     if re.search(r"(?m)^[ \t]*mtllib\b", text):
         _warn_of_materials(path)
-    lines = re.findall(r"(?m)^[ \t]*([vf])[ \t]+([^#\r\n]+)", text)
-    positions = [rest.split()[:3] for kind, rest in lines if kind == "v"]
+    positions: list[list[str]] = []
+    faces: list[list[int]] = []  # numbers of vertices, from 1
+    for kind, words in re.findall(r"(?m)^[ \t]*([vf])[ \t]+([^#\r\n]+)", text):
+        if kind == "v":
+            positions.append(words.split()[:3])
+        else:
+            faces.append([int(word.partition("/")[0]) for word in words.split()])
     vertices = np.array(positions, dtype=np.float64).reshape(len(positions), 3)
-    faces = [[int(word.partition("/")[0]) for word in rest.split()] for kind, rest in lines if kind == "f"]
     check_num_triangles(path, sum(max(len(face) - 2, 0) for face in faces))
     triangles = [(first, *edge) for first, *others in faces for edge in pairwise(others)]
     corners = np.array(triangles, dtype=np.int64).reshape(-1, 3) - 1
@@ -125,11 +132,13 @@ def _read_glb(data: bytes, path: Path) -> dict[str, np.ndarray]:
     ]
     names = _node_names(gltf.nodes)
     meshes: dict[str, np.ndarray] = {}
-    for number, world in _world_matrices(gltf.nodes, roots).items():
-        if "mesh" in gltf.nodes[number]:
-            placed = triangles_of[gltf.nodes[number]["mesh"]] @ world[:3, :3].T + world[:3, 3]
-            is_mirrored = np.linalg.det(world[:3, :3]) < 0
-            meshes[names[number]] = z_up_from_y_up(placed[:, ::-1] if is_mirrored else placed)
+    for node_index, world in _world_matrices(gltf.nodes, roots).items():
+        node = gltf.nodes[node_index]
+        if "mesh" in node:
+            triangles = triangles_of[node["mesh"]] @ world[:3, :3].T + world[:3, 3]
+            if np.linalg.det(world[:3, :3]) < 0:  # mirrored: the corners turn the other way
+                triangles = triangles[:, ::-1]
+            meshes[names[node_index]] = z_up_from_y_up(triangles)
     return meshes
 
 
@@ -139,27 +148,31 @@ def _chunks_of(data: bytes, path: Path) -> tuple[bytes, bytes]:
         raise InputError("the mesh file is not binary glTF 2.0", where=path, fix="export the mesh as binary glTF 2.0")
     chunks: dict[int, bytes] = {}
     end = GLB_HEADER_BYTES
-    while end + 8 <= len(data):
+    while end + CHUNK_HEADER_BYTES <= len(data):
         size, kind = struct.unpack_from("<II", data, end)
-        chunks.setdefault(kind, data[end + 8 : end + 8 + size])
-        end += 8 + size
+        begin = end + CHUNK_HEADER_BYTES
+        end = begin + size
+        chunks.setdefault(kind, data[begin:end])
     if end > len(data):
-        got, expected, fix = f"{len(data)} bytes", f"{end} bytes", "copy or export the mesh file again"
+        got = f"{len(data)} bytes"
+        expected = f"{end} bytes"
+        fix = "copy or export the mesh file again"
         raise InputError("the mesh file is incomplete", where=path, got=got, expected=expected, fix=fix)
     return chunks[JSON_CHUNK], chunks.get(BINARY_CHUNK, b"")
 
 
 class _Gltf:
-    """A glTF document and its binary chunk. primitives: The groups of triangles of each mesh."""
+    """A glTF document and its binary chunk."""
 
     def __init__(self, document: dict, binary: bytes) -> None:
-        self.document, self.binary = document, binary
-        self.nodes, self.accessors, self.views, meshes = (
-            document.get(name) or [] for name in ("nodes", "accessors", "bufferViews", "meshes")
-        )
-        self.primitives: list[list[dict]] = [
+        self.document = document
+        self.binary = binary
+        self.nodes = document.get("nodes") or []
+        self.accessors = document.get("accessors") or []
+        self.views = document.get("bufferViews") or []
+        self.primitives: list[list[dict]] = [  # the groups of triangles of each mesh
             [primitive for primitive in mesh["primitives"] if primitive.get("mode", TRIANGLES) >= TRIANGLES]
-            for mesh in meshes
+            for mesh in document.get("meshes") or []
         ]
 
     def num_triangles(self, primitive: dict) -> int:
@@ -171,14 +184,15 @@ class _Gltf:
 
     def accessors_of(self, primitive: dict) -> list[dict]:
         """Return the accessors of a primitive's indices, if it has them, and of its positions."""
-        numbers = (primitive["indices"],) if "indices" in primitive else ()
-        return [self.accessors[number] for number in (*numbers, primitive["attributes"]["POSITION"])]
+        keys = [primitive["indices"]] if "indices" in primitive else []
+        return [self.accessors[key] for key in (*keys, primitive["attributes"]["POSITION"])]
 
-    def numbers(self, accessor: dict, num_columns: int) -> np.ndarray:
+    def values(self, accessor: dict, num_columns: int) -> np.ndarray:
         """Return the values of an accessor, (n, num_columns), as a view on the binary chunk."""
         if accessor["type"] != {1: "SCALAR", 3: "VEC3"}[num_columns]:
             raise ValueError(f"an accessor of type {accessor['type']} is used for {num_columns} columns")
-        view, dtype = self.views[accessor["bufferView"]], np.dtype(DTYPES[accessor["componentType"]])
+        view = self.views[accessor["bufferView"]]
+        dtype = np.dtype(DTYPES[accessor["componentType"]])
         start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         strides = (view.get("byteStride") or num_columns * dtype.itemsize, dtype.itemsize)
         return np.ndarray((accessor["count"], num_columns), dtype, self.binary, start, strides)
@@ -186,29 +200,39 @@ class _Gltf:
     def triangles(self, primitive: dict) -> np.ndarray:
         """Return the triangles of a primitive, (k, 3, 3) float64."""
         *indices, positions = self.accessors_of(primitive)
-        corners = self.numbers(positions, 3)
+        corners = self.values(positions, 3)
         if indices:
-            corners = corners[self.numbers(indices[0], 1)[:, 0]]
+            corners = corners[self.values(indices[0], 1)[:, 0]]
         return corners[: len(corners) // 3 * 3].reshape(-1, 3, 3).astype(np.float64)
 
 
 def _check_features(gltf: _Gltf, path: Path) -> None:
     """Raise InputError if geometry is in a form or place that is not read; log a warning if there are materials."""
-    required = gltf.document.get("extensionsRequired") or []
-    found = [f"a glTF extension: {name}" for name in required if not APPEARANCE.match(name)]
-    found += ["data in another file" for buffer in gltf.document.get("buffers") or [] if "uri" in buffer]
-    for primitive in chain(*gltf.primitives):
-        found += ["strips or fans of triangles"] * (primitive.get("mode", TRIANGLES) != TRIANGLES)
-        for accessor in gltf.accessors_of(primitive) if not found else ():
-            found += ["a sparse accessor"] * ("sparse" in accessor)
-            found += ["an accessor without a bufferView"] * ("bufferView" not in accessor)
-    if found:
+    feature = next(_unsupported_features(gltf), None)
+    if feature is not None:
         what = "the mesh file uses a feature of glTF that is not supported"
         expected = "glTF 2.0 in one file, with lists of triangles"
         fix = "export the mesh again as .glb: triangles, without compression, sparse accessors and other extensions"
-        raise InputError(what, where=path, got=found[0][:99], expected=expected, fix=fix)
+        raise InputError(what, where=path, got=feature[:99], expected=expected, fix=fix)
     if gltf.document.get("materials"):
         _warn_of_materials(path)
+
+
+def _unsupported_features(gltf: _Gltf) -> Iterator[str]:
+    """Yield the words for features that are not read; an accessor in a later one may be missing or damaged."""
+    for name in gltf.document.get("extensionsRequired") or []:
+        if not APPEARANCE.match(name):
+            yield f"a glTF extension: {name}"
+    if any("uri" in buffer for buffer in gltf.document.get("buffers") or []):
+        yield "data in another file"
+    for primitive in chain(*gltf.primitives):
+        if primitive.get("mode", TRIANGLES) != TRIANGLES:
+            yield "strips or fans of triangles"
+        for accessor in gltf.accessors_of(primitive):
+            if "sparse" in accessor:
+                yield "a sparse accessor"
+            if "bufferView" not in accessor:
+                yield "an accessor without a bufferView"
 
 
 def _check_counts(gltf: _Gltf, path: Path) -> None:
@@ -218,7 +242,8 @@ def _check_counts(gltf: _Gltf, path: Path) -> None:
     num_bytes = [view["byteLength"] for view in gltf.views]
     if min(num_bytes, default=0) < 0 or max(num_bytes, default=0) > len(gltf.binary):
         what = "a buffer view of the mesh file declares more bytes than there are, or a negative number"
-        got, expected = f"{min(num_bytes):,} to {max(num_bytes):,} bytes", f"0 to {len(gltf.binary):,} bytes"
+        got = f"{min(num_bytes):,} to {max(num_bytes):,} bytes"
+        expected = f"0 to {len(gltf.binary):,} bytes"
         fix = "copy or export the mesh file again"
         raise InputError(what, where=path, got=got, expected=expected, fix=fix)
     num_triangles = [sum(map(gltf.num_triangles, primitives)) for primitives in gltf.primitives]
@@ -228,28 +253,30 @@ def _check_counts(gltf: _Gltf, path: Path) -> None:
 
 
 def _roots_of(gltf: _Gltf, path: Path) -> list[int]:
-    """Return the nodes at the top of the scene; without scenes those that are no child."""
+    """Return the nodes at the top of the scene; without scenes, the nodes that are no child."""
     children = [child for node in gltf.nodes for child in node.get("children", ())]
     if "scenes" in gltf.document:
         roots = gltf.document["scenes"][gltf.document.get("scene", 0)].get("nodes", [])
     else:
         roots = sorted(set(range(len(gltf.nodes))) - set(children))
     if repeated := [node for node, count in Counter([*children, *roots]).items() if count > 1]:  # also a cycle
-        what, got = "a node of the mesh file has two parents", f"node {repeated[0]}"
+        what = "a node of the mesh file has two parents"
+        got = f"node {repeated[0]}"
         raise InputError(what, where=path, got=got, expected="one parent at most", fix="export the mesh again")
     return roots
 
 
 def _node_names(nodes: list[dict]) -> list[str]:
-    """Return a different name for each node: its own, or its number."""
+    """Return a different name for each node: its own or its index, with a suffix if another node has that name."""
     counts = Counter[str]()
-    names: dict[str, int] = {}
-    for number, node in enumerate(nodes):
-        name = unique = str(node.get("name", number))
+    names: dict[str, None] = {}
+    for index, node in enumerate(nodes):
+        name = str(node.get("name", index))
+        unique = name
         while unique in names:
             counts[name] += 1
             unique = f"{name}_{counts[name]}"
-        names[unique] = number
+        names[unique] = None
     return list(names)
 
 
@@ -260,15 +287,15 @@ def _world_matrices(nodes: list[dict], roots: list[int]) -> dict[int, np.ndarray
     matrices: dict[int, np.ndarray] = {}
     waiting = [(root, np.eye(4)) for root in reversed(roots)]
     while waiting:
-        number, parent = waiting.pop()
-        node = nodes[number]
+        index, parent = waiting.pop()
+        node = nodes[index]
         local = np.reshape(node.get("matrix", np.eye(4)), (4, 4)).T.astype(float)
         local[:3, 3] += np.array(node.get("translation", (0.0, 0.0, 0.0)), dtype=float)
         if "rotation" in node:
             local[:3, :3] @= Rotation.from_quat(node["rotation"]).as_matrix()
         local[:3, :3] *= node.get("scale", (1.0, 1.0, 1.0))
-        matrices[number] = parent @ local
-        waiting += [(child, matrices[number]) for child in reversed(node.get("children", ()))]
+        matrices[index] = parent @ local
+        waiting += [(child, matrices[index]) for child in reversed(node.get("children", ()))]
     return matrices
 
 
@@ -281,17 +308,17 @@ def write_meshes(path: Path, meshes: dict[str, np.ndarray]) -> None:
     views: list[dict] = []
     accessors: list[dict] = []
     binary = bytearray()
-    for number, (name, triangles) in enumerate(meshes.items()):
+    for index, (name, triangles) in enumerate(meshes.items()):
         corners = y_up_from_z_up(triangles.reshape(-1, 3))
         middle = np.round((corners.min(axis=0) + corners.max(axis=0)) / 2)
         offsets = (corners - middle).astype("<f4")
         accessors.append(
-            {"bufferView": number, "componentType": FLOAT, "type": "VEC3", "count": len(offsets),
+            {"bufferView": index, "componentType": FLOAT, "type": "VEC3", "count": len(offsets),
              "min": offsets.min(axis=0).tolist(), "max": offsets.max(axis=0).tolist()}
         )  # fmt: skip
         views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": offsets.nbytes, "target": ARRAY_BUFFER})
         binary += offsets.tobytes()
-        nodes.append({"name": name, "mesh": number, "translation": middle.tolist()})
+        nodes.append({"name": name, "mesh": index, "translation": middle.tolist()})
     document = {
         "asset": {"version": "2.0", "generator": "cosfly"}, "scene": 0, "scenes": [{"nodes": list(range(len(nodes)))}],
         "nodes": nodes,

@@ -30,20 +30,16 @@ START_M = 1e-3  # a mesh that stands on the ground of its axes begins this near 
 
 
 class MeshRef(BaseModel):
-    """The mesh that is drawn instead of a box.
-
-    fit `box`: The bounds of the mesh are stretched to the box, axis by axis. fit `world`: Its vertices are positions in
-    the map, in metres; if several boxes name the same mesh, it is drawn once, with the id of the first box.
-
-    up: The axis that points up in the file; without it y in glTF and z in an OBJ.
-    """
+    """The mesh that is drawn instead of a box."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     file: str = Field(min_length=1, max_length=1024)
-    node: str | None = None
+    node: str | None = None  # None: all nodes of the file
+    # box: the bounds of the mesh are stretched to the box, axis by axis. world: its vertices are positions in the map,
+    # in metres; if several boxes name the same mesh, it is drawn once, with the id of the first box.
     fit: Literal["box", "world"] = "box"
-    up: Literal["y", "z"] | None = None
+    up: Literal["y", "z"] | None = None  # the axis that points up in the file; None: y in glTF, z in an OBJ
 
     @field_validator("file")
     @classmethod
@@ -58,13 +54,11 @@ class MeshRef(BaseModel):
 
 @dataclass(frozen=True)
 class Meshes:
-    """The meshes of a map. refs: Box id -> the mesh that is drawn. folder: The folder of the files. made: Node -> mesh,
-    of a MESHES_FILE that is not written yet.
-    """
+    """The meshes of a map."""
 
-    refs: dict[int, MeshRef] = field(default_factory=dict)
-    folder: Path | None = None
-    made: dict[str, np.ndarray] = field(default_factory=dict)
+    refs: dict[int, MeshRef] = field(default_factory=dict)  # box id -> the mesh that is drawn
+    folder: Path | None = None  # of the files
+    made: dict[str, np.ndarray] = field(default_factory=dict)  # node -> mesh, of a MESHES_FILE that is not written yet
 
     def files(self) -> dict[str, Path]:
         """Return the files that boxes name, by name."""
@@ -72,20 +66,16 @@ class Meshes:
         return {name: self.folder / name for name in names} if self.folder is not None else {}
 
     def resolved(self) -> dict[MeshRef, np.ndarray]:
-        """Read the meshes that the boxes name."""
-        nodes_by_file = {
-            name: read_meshes(path, tree=path.parents[len(Path(name).parts) - 1]) for name, path in self.files().items()
-        }
+        """Read the meshes that the boxes name, (k, 3, 3) m, z up."""
+        folder = self.folder or Path()
+        nodes_by_file = {name: read_meshes(path, tree=folder) for name, path in self.files().items()}
         meshes: dict[MeshRef, np.ndarray] = {}
         for box_id, ref in self.refs.items():
             nodes = nodes_by_file.get(ref.file, self.made)
             if ref.node is not None and ref.node not in nodes:
-                raise InputError(
-                    "the mesh file has no node of this name",
-                    where=f"box {box_id}: {ref.file}",
-                    got=ref.node[:80],
-                    expected=f"the name of a node in this file, such as {', '.join(list(nodes)[:8])}",
-                )
+                what = "the mesh file has no node of this name"
+                expected = f"the name of a node in this file, such as {', '.join(list(nodes)[:8])}"
+                raise InputError(what, where=f"box {box_id}: {ref.file}", got=ref.node[:80], expected=expected)
             if ref not in meshes:
                 mesh = np.concatenate(list(nodes.values())) if ref.node is None else nodes[ref.node]
                 meshes[ref] = self._turned(mesh, ref)
@@ -110,14 +100,14 @@ class Meshes:
         """Return the meshes moved to MESHES_FILE of a folder, writing it where needed."""
         if not self.refs or (self.folder == folder and not self.made):
             return self
-        names: dict[MeshRef, str] = {}
-        loaded = self.resolved()
-        for ref in loaded:
+        meshes = self.resolved()
+        node_names: dict[MeshRef, str] = {}
+        for ref in meshes:
             name = ref.node if self.made and ref.node else f"{ref.file}#{ref.node or ''}"
-            if name in names.values():  # another reference to the same node
+            if name in node_names.values():  # another reference to the same node
                 name += f" ({ref.fit}, {ref.up})" if ref.up else f" ({ref.fit})"
-            names[ref] = name
-        write_meshes(folder / MESHES_FILE, {names[ref]: mesh for ref, mesh in loaded.items()})
+            node_names[ref] = name
+        write_meshes(folder / MESHES_FILE, {node_names[ref]: mesh for ref, mesh in meshes.items()})
         # Without `up`: `resolved` has turned the meshes.
-        moved = {ref: MeshRef(file=MESHES_FILE, node=name, fit=ref.fit) for ref, name in names.items()}
+        moved = {ref: MeshRef(file=MESHES_FILE, node=name, fit=ref.fit) for ref, name in node_names.items()}
         return replace(self, refs={box_id: moved[ref] for box_id, ref in self.refs.items()}, folder=folder, made={})

@@ -35,18 +35,14 @@ PATHS_FORMAT = FileFormat("cosfly.path", "1.0", "pedestrian paths")
 
 @dataclass(frozen=True)
 class PedestrianTrajectory:
-    """One pedestrian trajectory, the product of stage 3.
-
-    polyline_m: (k, 2) the A* route, adapted to the pace. time_s: (n,), even steps from 0.
-    positions_m: (n, 3), feet on the ground. speeds_mps: (n,), 0 at a stop. pace: the profile.
-    """
+    """One pedestrian trajectory, the product of stage 3."""
 
     path_id: str
-    polyline_m: np.ndarray
-    time_s: np.ndarray
-    positions_m: np.ndarray
-    speeds_mps: np.ndarray
-    pace: str = PLAIN_PACE
+    polyline_m: np.ndarray  # (k, 2), the A* route, adapted to the pace
+    time_s: np.ndarray  # (n,), even steps from 0
+    positions_m: np.ndarray  # (n, 3), feet on the ground
+    speeds_mps: np.ndarray  # (n,), 0 at a stop
+    pace: str = PLAIN_PACE  # one of speed_model.PACES
 
     def as_json(self) -> dict:
         return {

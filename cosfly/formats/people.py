@@ -47,7 +47,7 @@ class Appearance:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            allowed = _rows(name, vars(self))
+            allowed = _allowed(name, vars(self))
             if value not in allowed:
                 raise ValueError(f"the field {name} must be one of {', '.join(map(repr, allowed))}")
 
@@ -60,24 +60,25 @@ class Appearance:
 
 @dataclass(frozen=True)
 class People:
-    """The appearance of the people in one track: the target, and the bystanders by instance id."""
+    """The appearance of the people in one track."""
 
     target: Appearance
-    others: dict[int, Appearance]
+    others: dict[int, Appearance]  # bystanders by instance id
 
-    def most_alike(self, numbers: Iterable[int]) -> tuple[int, int] | tuple[None, None]:
-        """Return the id of the person most similar to the target, and the number of differences.
+    def most_alike(self, instance_ids: Iterable[int]) -> tuple[int, int] | tuple[None, None]:
+        """Return the id of the bystander most similar to the target, and the number of differences.
 
-        Of several equally similar ones, the largest id; (None, None) without any.
+        Of several equally similar ones, the largest id counts. Return (None, None) without any.
         """
-        differing = [(len(self.target.differences(self.others[number])), -number) for number in numbers]
-        if not differing:
+        num_differences = {number: len(self.target.differences(self.others[number])) for number in instance_ids}
+        if not num_differences:
             return None, None
-        num_differences, number = min(differing)
-        return -number, num_differences
+        most_alike = min(num_differences, key=lambda number: (num_differences[number], -number))
+        return most_alike, num_differences[most_alike]
 
 
-def _rows(name: str, record: dict) -> tuple[str, ...]:
+def _allowed(name: str, record: dict) -> tuple[str, ...]:
+    """Return the values that a field of an appearance may have; a missing garment has no colour."""
     if name == "figure":
         return tuple(FIGURES)
     if name in GARMENTS:
@@ -92,12 +93,12 @@ GOAL_TERMS = ("figure", *GARMENT_TERMS, "left", "right", "near", "far")
 
 @dataclass(frozen=True)
 class Goal:
-    """A description that is true only of the target in one frame. says: The GOAL_TERMS that it uses."""
+    """A description that is true only of the target in one frame."""
 
     frame: Annotated[int, Field(strict=True, ge=0)]
     en: str
     zh: str
-    says: tuple[str, ...]
+    says: tuple[str, ...]  # the GOAL_TERMS that it uses
 
     def __post_init__(self) -> None:
         in_order = tuple(term for term in GOAL_TERMS if term in self.says)

@@ -40,71 +40,57 @@ STANDS_M = 0.1  # a target that moves less between these two frames is standing
 
 @dataclass(frozen=True)
 class TargetRecord:
-    """The target in the n frames of a track; values that are null or unknown are NaN.
+    """The target in the n frames of a track; values that are null or unknown are NaN."""
 
-    in_view, visible: (n,) bool, `visible` accounts for occlusion. depth_m: (n,) z-depth. uv: (n, 2) px. bbox: (n, 4)
-    xmin, ymin, xmax, ymax px of the projected 3D box. visibility: (n,) rendered score in [0, 1]. mask_bbox: (n, 4) of
-    the target's pixels. legible: (n,) bool. The last two are None if the file has no such field.
-    """
-
-    in_view: np.ndarray
-    visible: np.ndarray
-    depth_m: np.ndarray
-    uv: np.ndarray
-    bbox: np.ndarray
-    visibility: np.ndarray
-    mask_bbox: np.ndarray | None = None
-    legible: np.ndarray | None = None
+    in_view: np.ndarray  # (n,) bool
+    visible: np.ndarray  # (n,) bool, accounts for occlusion
+    depth_m: np.ndarray  # (n,) z-depth
+    uv: np.ndarray  # (n, 2) px
+    bbox: np.ndarray  # (n, 4) xmin, ymin, xmax, ymax px of the projected 3D box
+    visibility: np.ndarray  # (n,) rendered score in [0, 1]
+    mask_bbox: np.ndarray | None = None  # (n, 4) of the target's pixels; None if the file has no such field
+    legible: np.ndarray | None = None  # (n,) bool; None if the file has no such field
 
 
 @dataclass(frozen=True)
 class Perturbation:
     """The offsets that were applied to each of n frames.
 
-    is_perturbed: (n,) bool. drone_m, rotation_deg, target_m: (n, 3), zero if nothing was applied, NaN if unknown:
-    public files store only that there was an offset.
+    They are zero if nothing was applied, and NaN if unknown: public files store only that there was an offset.
     """
 
-    is_perturbed: np.ndarray
-    drone_m: np.ndarray
-    rotation_deg: np.ndarray
-    target_m: np.ndarray
+    is_perturbed: np.ndarray  # (n,) bool
+    drone_m: np.ndarray  # (n, 3)
+    rotation_deg: np.ndarray  # (n, 3) pitch, yaw, roll
+    target_m: np.ndarray  # (n, 3)
 
 
 @dataclass(frozen=True)
 class Track:
-    """One `trajectory.json`, n points, in right-handed axes: poses, times, target and camera, and optional records.
-
-    time_s: (n,) strictly increasing. positions_m: (n, 3). rotations_deg: (n, 3) pitch, yaw, roll of the camera.
-    targets_m: (n, 3) hip of the target, NaN if the file has none. segments, mission: As planned.
-
-    Optional fields, None if the file has none. intrinsics: (n, 3, 3) of a camera that zooms; otherwise `camera` is that
-    of all frames (`camera_at` covers both). people: Their appearance. goal: The description of the target. bystanders:
-    (n, 5), frames.BYSTANDER_COLUMNS.
-    """
+    """One `trajectory.json`, n points, in right-handed axes; optional records are None if the file has none."""
 
     town: str
     trajectory: str
     variant: str
-    camera: Camera
-    time_s: np.ndarray
-    positions_m: np.ndarray
-    rotations_deg: np.ndarray
-    targets_m: np.ndarray
+    camera: Camera  # of the file; `camera_at` returns that of a frame
+    time_s: np.ndarray  # (n,) strictly increasing
+    positions_m: np.ndarray  # (n, 3) of the drone
+    rotations_deg: np.ndarray  # (n, 3) pitch, yaw, roll of the camera
+    targets_m: np.ndarray  # (n, 3) hip of the target, NaN if the file has none
     target: TargetRecord
     perturbation: Perturbation
-    source: dict = field(default_factory=dict)
-    is_original: bool = True
+    source: dict = field(default_factory=dict)  # facts of the plan
+    is_original: bool = True  # a clean track
     folder: Path | None = None
-    raw: dict = field(default_factory=dict)
+    raw: dict = field(default_factory=dict)  # the file, with its unknown keys
     issues: tuple[InputError, ...] = ()  # deviations from the layout
     run: str = ""  # set if tracks of several runs are combined
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
-    intrinsics: np.ndarray | None = None
+    intrinsics: np.ndarray | None = None  # (n, 3, 3) of a camera that zooms
     people: People | None = None
     goal: Goal | None = None
-    bystanders: np.ndarray | None = None
+    bystanders: np.ndarray | None = None  # (n, 5), frames.BYSTANDER_COLUMNS
     given_id: str | None = None  # set if the plain id is not unique among several towns or runs (places.py)
 
     def __len__(self) -> int:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import numpy as np
 from pydantic import AliasChoices, AliasPath, BaseModel, Field, PlainValidator
@@ -33,7 +33,8 @@ WAYPOINT_TOLERANCE_M = 1e-5  # the bound of the public readers on nav_waypoint.t
 INTRINSIC = "a 3x3 matrix with a positive focal length"
 MOST_POINTS = 500_000  # four hours at 30 Hz; each takes kilobytes of memory while it is read
 STEP_TOLERANCE_S = 1e-3  # largest difference between a time step and the median step
-BBOX, UV = ("xmin", "ymin", "xmax", "ymax"), ("u", "v")
+BBOX = ("xmin", "ymin", "xmax", "ymax")
+UV = ("u", "v")
 OFFSETS = {"drone_position": XYZ, "drone_rotation": ANGLES, "target_position": XYZ}  # in a point's perturbation
 TREE_ACTION = ("forward_mps", "right_mps", "up_mps", "yaw_rate_degps", "gimbal_pitch_deg")  # motion.ACTION, mirrored
 TREE_ACTION_SIGNS = np.array([1.0, -1.0, 1.0, -1.0, 1.0])  # left becomes right, counter-clockwise clockwise
@@ -66,7 +67,7 @@ def _offset(names: tuple[str, ...], value: Any) -> list[float]:
 
 
 def _at(*paths: str, default: Any = None) -> Any:
-    """Return a field of a point that is found at the first of some paths; without one its default is validated."""
+    """Return a field of a point that is read from the first of some paths that exists, else from its default."""
     choices = AliasChoices(*(AliasPath(*path.split(".")) for path in paths))
     return Field(default, validation_alias=choices, validate_default=True)
 
@@ -146,32 +147,22 @@ def read_track(folder: Path) -> Track:
     poses = np.nan_to_num(poses)  # a missing angle has become NaN
     time_s = np.array([point.time_s for point in points])
     _check_order(time_s, path)
-    constants = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "trace_dir": place.variant}
-    found = [(key, shown(raw.get(key)), shown(value)) for key, value in constants.items() if raw.get(key) != value]
     what = "the field does not follow the format of the file"
     issues = [
-        InputError(what, where=f"{path}: {where}", got=got, expected=expected)
-        for where, got, expected in (*found, *_deviations(raw, points, time_s, poses))
+        InputError(what, where=f"{path}: {deviation.field}", got=deviation.got, expected=deviation.expected)
+        for deviation in _deviations(raw, place.variant, points, time_s, poses)
     ]
-
-    def optional(read: Callable[[], Value]) -> Value | None:
-        """Return an optional field; add its error to the issues and return None if its content is invalid."""
-        try:
-            return read()
-        except InputError as error:
-            issues.append(error)
-            return None
-
-    segments, mission = optional(lambda: read_flown(raw, len(points), str(path))) or ((), None)
-    people = goal = None
+    segments, mission = _optional(lambda: read_flown(raw, len(points), str(path)), issues) or ((), None)
+    people = None
+    goal = None
     if "people" in raw:
-        people = optional(lambda: validated(People, raw["people"], f"{path}: people"))
+        people = _optional(lambda: validated(People, raw["people"], f"{path}: people"), issues)
     if raw.get("goal") is not None and "absent" not in object_of(raw, "goal"):
-        goal = optional(lambda: read_goal(raw["goal"], len(points), f"{path}: goal"))
+        goal = _optional(lambda: read_goal(raw["goal"], len(points), f"{path}: goal"), issues)
     if {"params", "mode"} & object_of(raw, "weather").keys():  # public files may use this key otherwise
-        optional(lambda: validated(WeatherRecord, raw["weather"], f"{path}: weather"))
+        _optional(lambda: validated(WeatherRecord, raw["weather"], f"{path}: weather"), issues)
     is_original = bool(object_of(raw, "augmentation").get("is_original", place.variant == ORIGINAL))
-    matrices = np.array([camera.intrinsic if (own := _matrix(point.intrinsic)) is None else own for point in points])
+    matrices = np.stack([_intrinsic_of(point, camera) for point in points])
     positions_m, rotations_deg = np.hsplit(mirror_poses(poses), 2)
     return Track(
         **vars(place),
@@ -196,55 +187,90 @@ def read_track(folder: Path) -> Track:
     )
 
 
+def _optional(read: Callable[[], Value], issues: list[InputError]) -> Value | None:
+    """Return an optional field; add its error to the issues and return None if its content is invalid."""
+    try:
+        return read()
+    except InputError as error:
+        issues.append(error)
+        return None
+
+
 def _camera_of(record: _Camera, path: Path) -> Camera:
-    matrix, size = _matrix(record.intrinsic), f"{record.width:g} x {record.height:g} px"
+    matrix = _matrix(record.intrinsic)
     if matrix is None:
-        what, got = "the intrinsic matrix of the camera is invalid", shown(record.intrinsic)
+        what = "the intrinsic matrix of the camera is invalid"
+        got = shown(record.intrinsic)
         raise InputError(what, where=f"{path}: camera.intrinsic", got=got, expected=INTRINSIC)
-    check_pixels(record.width * record.height, f"{path}: camera", size)
+    check_pixels(record.width * record.height, f"{path}: camera", f"{record.width:g} x {record.height:g} px")
     return Camera(int(record.width), int(record.height), matrix)
+
+
+def _intrinsic_of(point: _Point, camera: Camera) -> np.ndarray:
+    """Return the intrinsic matrix of a point, (3, 3): its own, or that of the track's camera."""
+    matrix = _matrix(point.intrinsic)
+    return camera.intrinsic if matrix is None else matrix
 
 
 def _check_order(time_s: np.ndarray, path: Path) -> None:
     steps = np.diff(time_s)
     if (steps <= 0).any():
         where = f"{path}: points[{int(np.argmax(steps <= 0)) + 1}].timing.trace_timestamp"
-        what, got = "the times of the points do not increase", f"a step of {steps.min():g} s"
+        what = "the times of the points do not increase"
+        got = f"a step of {steps.min():g} s"
         raise InputError(what, where=where, got=got, expected="strictly increasing times")
 
 
-def _deviations(raw: dict, points: list[_Point], time_s: np.ndarray, poses: np.ndarray) -> Iterator[tuple[str, ...]]:
-    """Yield where the points deviate from the format, what is there and what is expected.
+class _Deviation(NamedTuple):
+    """A field that does not follow the format, and still can be read."""
 
-    poses: (n, 6), in the axes of the file.
-    """
+    field: str
+    got: str
+    expected: str
+
+
+def _deviations(
+    raw: dict, variant: str, points: list[_Point], time_s: np.ndarray, poses: np.ndarray
+) -> Iterator[_Deviation]:
+    """Yield the deviations of a file from the format. poses: (n, 6), in the axes of the file."""
+    for key, value in {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "trace_dir": variant}.items():
+        if raw.get(key) != value:
+            yield _Deviation(key, shown(raw.get(key)), shown(value))
     if "points" not in raw:
-        yield "points", "missing", "a list of objects"
+        yield _Deviation("points", "missing", "a list of objects")
     for i, (point, record) in enumerate(zip(points, raw.get("points") or raw["waypoints"], strict=True)):
         if point.index != i:
-            yield f"points[{i}].index", shown(point.index), str(i)
+            yield _Deviation(f"points[{i}].index", shown(point.index), str(i))
         if "trace_timestamp" not in object_of(record, "timing"):
-            yield f"points[{i}].timing.trace_timestamp", "missing", "a finite number"
+            yield _Deviation(f"points[{i}].timing.trace_timestamp", "missing", "a finite number")
         for name in ("pitch", "roll"):
             if getattr(point.drone_pose, name) is None:
-                yield f"points[{i}].drone_pose.{name}", "null", "a finite number"
+                yield _Deviation(f"points[{i}].drone_pose.{name}", "null", "a finite number")
         if point.intrinsic is not None and _matrix(point.intrinsic) is None:
-            yield f"points[{i}].camera.intrinsic", shown(point.intrinsic), INTRINSIC
-    steps, dt_s = np.diff(time_s), step_s(time_s)
+            yield _Deviation(f"points[{i}].camera.intrinsic", shown(point.intrinsic), INTRINSIC)
+    steps = np.diff(time_s)
+    dt_s = step_s(time_s)
     if (np.abs(steps - dt_s) > STEP_TOLERANCE_S).any():
         got = f"steps of {steps.min():.3f} to {steps.max():.3f} s"
-        yield "points[].timing.trace_timestamp", got, f"equal steps of {dt_s:g} s"
+        yield _Deviation("points[].timing.trace_timestamp", got, f"equal steps of {dt_s:g} s")
+    yield from _first_wrong_waypoint(points, poses)
+    if any(point.target is not None and not (isinstance(point.target, dict) and point.target) for point in points):
+        yield _Deviation("points[].target", "missing", "an object, or null without a target")
+
+
+def _first_wrong_waypoint(points: list[_Point], poses: np.ndarray) -> Iterator[_Deviation]:
+    """Yield one deviation if a waypoint is not the position of the next point, or the last one is not null."""
     waypoints = np.array([_vector(XYZ, point.waypoint) for point in points])
     is_right = (np.abs(waypoints[:-1] - poses[1:, :3]) <= WAYPOINT_TOLERANCE_M).all(axis=1)
-    wrong = [
-        i for i, point in enumerate(points) if not (is_right[i] if i + 1 < len(points) else point.waypoint is None)
-    ]
-    for i in wrong[:1]:  # one issue per file
-        is_last = i + 1 == len(points)
-        expected = "null at the last point" if is_last else f"the next point's position {poses[i + 1, :3].tolist()}"
-        yield f"points[{i}].nav_waypoint.t1_world", shown(points[i].waypoint), expected
-    if any(point.target is not None and not (isinstance(point.target, dict) and point.target) for point in points):
-        yield "points[].target", "missing", "an object, or null without a target"
+    if not is_right.all():
+        i = int(np.argmin(is_right))
+        expected = f"the next point's position {poses[i + 1, :3].tolist()}"
+    elif points[-1].waypoint is not None:
+        i = len(points) - 1
+        expected = "null at the last point"
+    else:
+        return
+    yield _Deviation(f"points[{i}].nav_waypoint.t1_world", shown(points[i].waypoint), expected)
 
 
 def _column(points: list[_Point], name: str) -> np.ndarray:
@@ -347,11 +373,19 @@ def _put_point(point: dict, track: Track, i: int) -> None:
     offsets = (track.perturbation.drone_m, track.perturbation.rotation_deg, track.perturbation.target_m)
     for (name, axes), values in zip(OFFSETS.items(), offsets, strict=True):
         _put_vector(point["perturbation"], name, axes, mirror_poses(values[i]))
-    if "target" in point and point["target"] is None and np.isnan(track.targets_m[i]).all():
-        return
-    visible, in_view = bool(track.target.visible[i]), bool(track.target.in_view[i])
-    seen = {"visible": visible, "in_view": in_view, "depth": _number_or_null(track.target.depth_m[i])}
-    point["target"] = target = _merged(point, "target", seen, {"enabled": True})
+    has_target = point.get("target", {}) is not None or not np.isnan(track.targets_m[i]).all()
+    if has_target:
+        point["target"] = _merged_target(point, track, i)
+
+
+def _merged_target(point: dict, track: Track, i: int) -> dict:
+    """Return the object `target` of point i with our values."""
+    ours = {
+        "visible": bool(track.target.visible[i]),
+        "in_view": bool(track.target.in_view[i]),
+        "depth": _number_or_null(track.target.depth_m[i]),
+    }
+    target = _merged(point, "target", ours, {"enabled": True})
     visibility = _number_or_null(track.target.visibility[i])
     if visibility is not None or "visibility" in target:
         target["visibility"] = visibility
@@ -360,6 +394,7 @@ def _put_point(point: dict, track: Track, i: int) -> None:
     _put_vector(target, "bbox_2d", BBOX, track.target.bbox[i])
     if track.target.mask_bbox is not None:
         _put_vector(target, "mask_bbox_2d", BBOX, track.target.mask_bbox[i])
+    return target
 
 
 def _put_vector(group: dict, key: str, names: tuple[str, ...] | None, values: np.ndarray) -> None:
@@ -382,10 +417,14 @@ def _put_vector(group: dict, key: str, names: tuple[str, ...] | None, values: np
 
 def _put_flags(perturbation: dict) -> None:
     """Replace the offsets of a perturbation by flags, and move those that are not zero to `offsets`."""
-    found = {name: perturbation.get(name) for name in OFFSETS}
-    offsets = {name: value for name, value in found.items() if isinstance(value, dict) and any(value.values())}
-    flags = {name: name in offsets or value is True for name, value in found.items()}
-    perturbation |= flags | ({"offsets": offsets} if offsets else {})
+    offsets = {}
+    for name in OFFSETS:
+        value = perturbation.get(name)
+        if isinstance(value, dict) and any(value.values()):
+            offsets[name] = value
+        perturbation[name] = name in offsets or value is True
+    if offsets:
+        perturbation["offsets"] = offsets
 
 
 def _action(action: np.ndarray) -> dict[str, float] | None:

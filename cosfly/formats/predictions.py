@@ -40,7 +40,8 @@ def read_predictions(path: Path) -> list[Prediction]:
     lines = model_lines(path, Prediction, what="predictions", fix="run cosfly distill infer first")
     for number, (_, prediction) in enumerate(lines, 1):
         if prediction.key in predictions:
-            what, fix = "the file has two predictions for one sample in one language", "remove one of the two lines"
+            what = "the file has two predictions for one sample in one language"
+            fix = "remove one of the two lines"
             raise InputError(what, where=f"{path}:{number}", got=prediction.key, fix=fix)
         predictions[prediction.key] = prediction
     return list(predictions.values())

@@ -55,13 +55,8 @@ class Roi(RoiPolygon):
         }
         for name, (what, expected) in expected_values.items():
             if (got := getattr(self, name)) not in ("", expected):
-                raise InputError(
-                    what,
-                    where=f"{where}: {name}",
-                    got=got,
-                    expected=expected,
-                    fix="draw the region on this map with cosfly roi edit",
-                )
+                fix = "draw the region on this map with cosfly roi edit"
+                raise InputError(what, where=f"{where}: {name}", got=got, expected=expected, fix=fix)
 
 
 def write_roi(path: Path, roi: Roi) -> None:
@@ -80,10 +75,12 @@ def parse_roi(data: bytes, path: Path) -> Roi:
     """Return the region of interest of a file's bytes."""
     roi = validated(Roi, parse_document(data, path), path)
     if not roi.closed:
-        what, fix = "the polygon of the region of interest is not closed", "close the polygon with cosfly roi edit"
+        what = "the polygon of the region of interest is not closed"
+        fix = "close the polygon with cosfly roi edit"
         raise InputError(what, where=f"{path}: closed", got="false", expected="true", fix=fix)
     if not roi.rings():
-        expected, fix = "a polygon with at least three points", "draw the region with cosfly roi edit"
+        expected = "a polygon with at least three points"
+        fix = "draw the region with cosfly roi edit"
         raise InputError("the region has no polygon", where=f"{path}: points_world", expected=expected, fix=fix)
     rings = [(k, ring) for k, polygon in enumerate(roi.rings()) for ring in (polygon.points_world, *polygon.holes)]
     num_vertices = sum(len(ring) for _, ring in rings)

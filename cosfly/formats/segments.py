@@ -21,12 +21,12 @@ Coordinate = Annotated[float, Field(strict=True, ge=-LARGEST, le=LARGEST)]
 
 @dataclass(frozen=True)
 class Segment:
-    """Frames [begin, end) of one manoeuvre style. keeps_sight: Whether the visibility of the target counts in them."""
+    """Frames [begin, end) of one manoeuvre style."""
 
     style: str
     begin: Frame
     end: Frame
-    keeps_sight: bool = True
+    keeps_sight: bool = True  # whether the visibility of the target counts in them
 
 
 def _coordinates(value: Any) -> list:

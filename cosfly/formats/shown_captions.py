@@ -13,21 +13,17 @@ from cosfly.formats.playback import Track
 
 @dataclass(frozen=True)
 class ShownCaption:
-    """One caption of a track. frame_index: Its current frame. prompts: By language, empty where none is released.
-
-    texts: By language and field. values: By language, numbers of values (`ValueCounts`), None where not counted.
-    evidence: JSON of `captions.Evidence`. picture_px: (width, height) of the pictures, to which pixels refer.
-    """
+    """One caption of a released track."""
 
     sample_id: str
-    frame_index: int
+    frame_index: int  # of its current frame
     window: Sequence[int]
-    picture_px: tuple[int, ...]
-    prompts: dict[Language, str]
-    texts: dict[Language, dict[str, str]]
+    picture_px: tuple[int, ...]  # (width, height) of the pictures, to which pixels refer
+    prompts: dict[Language, str]  # empty where none is released
+    texts: dict[Language, dict[str, str]]  # by language and field
     writing: Writing
-    values: dict[Language, tuple[int | None, ...]]
-    evidence: str
+    values: dict[Language, tuple[int | None, ...]]  # numbers of values (`ValueCounts`); None where not counted
+    evidence: str  # JSON of `captions.Evidence`
     decision: str
     repair: str | None
     label: str | None
@@ -36,13 +32,12 @@ class ShownCaption:
 
 @dataclass(frozen=True)
 class ReleasedTrack:
-    """A track. flight: All of its points. captions: Those that are released. twin: The clean track of a perturbed one;
-    None if not released. settings: Those recorded for the captions; empty means the defaults."""
+    """A track of a release."""
 
-    flight: Track
-    captions: Sequence[ShownCaption]
-    twin: Track | None
-    settings: dict[str, Any]
+    flight: Track  # with all of its points
+    captions: Sequence[ShownCaption]  # those that are released
+    twin: Track | None  # the clean track of a perturbed one; None if it is not released
+    settings: dict[str, Any]  # as recorded for the captions; empty means the defaults
 
 
 Mismatch = tuple[str, str, str, str]  # a contradiction: code, where, got and expected of its finding

@@ -1,5 +1,4 @@
-"""Files in a town's folder of the playback tree: `map.json` (name and licence of the map) and `instance_ids.json` (the
-box of each id in `instance.png`)."""
+"""Files in a town's folder of the playback tree: `map.json` and `instance_ids.json`."""
 
 from pathlib import Path
 
@@ -9,22 +8,24 @@ from pydantic import Field
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader
 from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
-IDS_FILE, IDS_FORMAT = "instance_ids.json", FileFormat("cosfly.instance_ids", "1.0", "record of ids")
-TOWN_FILE, TOWN_FORMAT = "map.json", FileFormat("cosfly.town_map", "1.0", "record of the town's map")
+IDS_FILE = "instance_ids.json"
+IDS_FORMAT = FileFormat("cosfly.instance_ids", "1.0", "record of ids")
+TOWN_FILE = "map.json"
+TOWN_FORMAT = FileFormat("cosfly.town_map", "1.0", "record of the town's map")
 
 
 class TownMap(Record):
-    """The map of a town: its name, licence and attribution (one sentence or more)."""
+    """`map.json`: the map of a town."""
 
     name: str
     licence: LicenceId
-    credits: str
+    credits: str  # the attribution, in one or more sentences
 
 
 def write_town_map(town: Path, header: MapHeader) -> Path:
     """Write what `read_town_map` reads; return the file."""
-    shown = TownMap(name=header.name, licence=header.licence, credits=header.credits)
-    write_model(town / TOWN_FILE, shown, TOWN_FORMAT)
+    town_map = TownMap(name=header.name, licence=header.licence, credits=header.credits)
+    write_model(town / TOWN_FILE, town_map, TOWN_FORMAT)
     return town / TOWN_FILE
 
 
@@ -36,14 +37,14 @@ def read_town_map(town: Path) -> TownMap:
 
 
 class InstanceIds(Record):
-    """person: The target's id. shared: Of boxes without an id. others: Of bystanders. boxes: (id, box id)."""
+    """`instance_ids.json`: the ids in `instance.png`, and the boxes that have them."""
 
-    person: int
-    shared: int
-    others: list[int] = Field([])
-    num_shared: int
-    are_box_ids: bool
-    boxes: list[tuple[int, int]]
+    person: int  # id of the target
+    shared: int  # id of all boxes without an id of their own
+    others: list[int] = Field([])  # ids of bystanders
+    num_shared: int  # number of boxes with the id `shared`
+    are_box_ids: bool  # whether each box has its number in the map as its id
+    boxes: list[tuple[int, int]]  # (id, id of the box in the map)
 
     def of_boxes(self, box_map: BoxMap) -> np.ndarray:
         """Return the ids of a map's boxes, (n,); `shared` for a box that is not listed."""

@@ -41,14 +41,11 @@ class _Part(BaseModel):
 
 @dataclass(frozen=True)
 class Excerpt:
-    """The whole trajectory from which a part is taken; clothes, stride and weather are drawn for the whole one.
-
-    number: Its index in its run. before_m: (m, 3), its tracked points up to the first of the part, m >= 1.
-    """
+    """The whole trajectory from which a part is taken; clothes, stride and weather are drawn for the whole one."""
 
     path_id: str
-    number: int
-    before_m: np.ndarray
+    number: int  # its index in its run
+    before_m: np.ndarray  # (m, 3), its tracked points up to the first of the part, m >= 1
 
     def as_json(self) -> dict:
         return {"id": self.path_id, "number": self.number, "before": [rounded(p, 4) for p in self.before_m]}
@@ -63,33 +60,24 @@ class Excerpt:
 
 @dataclass(frozen=True)
 class DroneTrace:
-    """One drone trajectory, the product of stage 4; n points at the pedestrian's time stamps.
-
-    time_s: (n,). positions_m: (n, 3) drone. rotations_deg: (n, 3) pitch, yaw, roll of the camera, which looks at the
-    target or follows it with a gimbal. targets_m: (n, 3) the pedestrian's tracked point (hip height). visibility: (n,)
-    five-ray fraction in [0, 1]. clearances_m: (n,) signed distance to the nearest obstacle, the least on the straight
-    way to the next point. metrics and solver: JSON-able facts. segments: Styles of its parts; empty if the drone
-    follows throughout. instead_of: The style that the map did not permit, with the reason; not_held: The requested and
-    the flown value. drop_reason: Why the prefilter (sec:step6) drops it; None if it passes and is rendered. pace: Of
-    the pedestrian trajectory.
-    """
+    """One drone trajectory, the product of stage 4; n points at the pedestrian's time stamps."""
 
     path_id: str
     planner: str
-    time_s: np.ndarray
-    positions_m: np.ndarray
-    rotations_deg: np.ndarray
-    targets_m: np.ndarray
-    visibility: np.ndarray
-    clearances_m: np.ndarray
-    metrics: dict = field(default_factory=dict)
-    solver: dict = field(default_factory=dict)
-    drop_reason: str | None = None
-    segments: tuple[Segment, ...] = ()
+    time_s: np.ndarray  # (n,)
+    positions_m: np.ndarray  # (n, 3) of the drone
+    rotations_deg: np.ndarray  # (n, 3) pitch, yaw, roll of the camera
+    targets_m: np.ndarray  # (n, 3) hip of the pedestrian
+    visibility: np.ndarray  # (n,) five-ray fraction in [0, 1]
+    clearances_m: np.ndarray  # (n,) least signed distance to an obstacle on the straight way to the next point
+    metrics: dict = field(default_factory=dict)  # JSON-able
+    solver: dict = field(default_factory=dict)  # JSON-able facts of the planner
+    drop_reason: str | None = None  # why the prefilter (sec:step6) drops it; None: it is rendered
+    segments: tuple[Segment, ...] = ()  # styles of its parts; empty if the drone follows throughout
     mission: Mission | None = None
-    instead_of: str | None = None
-    not_held: str | None = None
-    pace: str = PLAIN_PACE
+    instead_of: str | None = None  # the style that the map did not permit, with the reason
+    not_held: str | None = None  # the requested and the flown value
+    pace: str = PLAIN_PACE  # of the pedestrian trajectory
     part_of: Excerpt | None = None
 
     def drawn_as(self, number: int) -> Excerpt:
@@ -153,7 +141,8 @@ class DroneTrace:
             if not isinstance(record.get(group), dict):
                 raise InputError(MISSING, where=f"{where}.{group}", expected="an object with lists of numbers")
             groups.append(columns(record[group], names, f"{where}.{group}", len(time_s)))
-        visibility, clearances_m = (column(record, name, where, len(time_s)) for name in ("visibility", "clearance"))
+        visibility = column(record, "visibility", where, len(time_s))
+        clearances_m = column(record, "clearance", where, len(time_s))
         segments, mission = read_flown(record, len(time_s), where)
         return cls(
             path_id=text_id(record, where),

@@ -20,22 +20,17 @@ def find_tracks(root: Path, choice: TrackChoice = ALL_TRACKS) -> list[Path]:
         raise InputError("the directory of rendered tracks does not exist", where=root, fix="check the path")
     folders = [path.parent for path in files_named(root, "trajectory.json")]
     if not folders:
-        raise InputError(
-            "the directory does not contain rendered tracks",
-            where=root,
-            got="no trajectory.json in any folder below the directory",
-            expected="files such as Town*/trajectory_*/ORI/trajectory.json",
-            fix="pass the output directory of cosfly render as --data",
-        )
+        what = "the directory does not contain rendered tracks"
+        got = "no trajectory.json in any folder below the directory"
+        expected = "files such as Town*/trajectory_*/ORI/trajectory.json"
+        fix = "pass the output directory of cosfly render as --data"
+        raise InputError(what, where=root, got=got, expected=expected, fix=fix)
     matching = [folder for folder in folders if choice.names(folder.relative_to(root).as_posix())]
     if not matching:
-        raise InputError(
-            "no track folder in this directory matches the patterns of --flights",
-            where=root,
-            got=", ".join(choice.match),
-            expected=f"a pattern that matches a folder such as {folders[0].relative_to(root).as_posix()}",
-            fix="change --flights",
-        )
+        what = "no track folder in this directory matches the patterns of --flights"
+        expected = f"a pattern that matches a folder such as {folders[0].relative_to(root).as_posix()}"
+        fix = "change --flights"
+        raise InputError(what, where=root, got=", ".join(choice.match), expected=expected, fix=fix)
     if len(choice.tracks) == len(TRACKS):
         return matching
     chosen = [folder for folder in matching if track_of(folder) in choice.tracks]
@@ -60,13 +55,11 @@ def read_twin(track: Track) -> Track | None:
     twin = read_track(folder)
     has_same_times = len(twin) == len(track) and np.abs(twin.time_s - track.time_s).max() < TWIN_TOLERANCE_S
     if not (twin.is_original and has_same_times):
-        raise VerifyError(
-            "the track next to the perturbed one is not its clean twin",
-            where=twin.folder,
-            got=f"a {'clean' if twin.is_original else 'perturbed'} track, {_time_span(twin)}",
-            expected=f"a clean track, {_time_span(track)}",
-            fix="render both tracks again",
-        )
+        what = "the track next to the perturbed one is not its clean twin"
+        got = f"a {'clean' if twin.is_original else 'perturbed'} track, {_time_span(twin)}"
+        expected = f"a clean track, {_time_span(track)}"
+        fix = "render both tracks again"
+        raise VerifyError(what, where=twin.folder, got=got, expected=expected, fix=fix)
     return twin
 
 

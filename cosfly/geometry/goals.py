@@ -6,7 +6,8 @@ positions from ids and depth of the picture. `meant` computes from the same data
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,33 +16,57 @@ from cosfly.formats.captions import Language
 from cosfly.formats.frames import PERSON_ID
 from cosfly.formats.people import COLORS, FIGURES, GARMENTS, Appearance, Words
 
-# Slots of clothing, large ones first: Chinese verb for wearing it; English and Chinese words for an empty slot.
-SLOTS = {"top": ("穿",), "legs": ("穿",), "bag": ("背", "no bag", "不带包"), "hat": ("戴", "no hat", "不戴帽子")}
-# Relations to other people: words; sign of the value that is least for the target; least margin, as a share of the
-# picture's width or m from the camera.
+
+class ClothingSlot(NamedTuple):
+    """The words for a slot of clothing."""
+
+    preposition: str  # "in the red coat"
+    verb_zh: str  # for wearing it
+    none: Words | None = None  # for an empty slot; top and legs are never empty
+
+
+class Relation(NamedTuple):
+    """A relation of the target to all others: it has the least, or the greatest, depth or column of the picture."""
+
+    words: Words
+    sign: float  # of the value that is least for the target
+    margin: float  # least difference from the others: m of depth, or a share of the picture's width
+    is_depth: bool
+
+
+SLOTS = {  # large garments first
+    "top": ClothingSlot("in", "穿"),
+    "legs": ClothingSlot("in", "穿"),
+    "bag": ClothingSlot("with", "背", {"en": "no bag", "zh": "不带包"}),
+    "hat": ClothingSlot("with", "戴", {"en": "no hat", "zh": "不戴帽子"}),
+}
 SIDES = {
-    "left": ("leftmost", "最左边的", 1.0, 0.05), "right": ("rightmost", "最右边的", -1.0, 0.05),
-    "near": ("nearest", "离镜头最近的", 1.0, 1.0), "far": ("farthest", "离镜头最远的", -1.0, 1.0),
-}  # fmt: skip
+    "left": Relation({"en": "leftmost", "zh": "最左边的"}, 1.0, 0.05, is_depth=False),
+    "right": Relation({"en": "rightmost", "zh": "最右边的"}, -1.0, 0.05, is_depth=False),
+    "near": Relation({"en": "nearest", "zh": "离镜头最近的"}, 1.0, 1.0, is_depth=True),
+    "far": Relation({"en": "farthest", "zh": "离镜头最远的"}, -1.0, 1.0, is_depth=True),
+}
 PICTURE_PX = 160  # least longer side of a target picture
 ROOM_SHARE, ROOM_PX = 0.25, 8  # room around the person in it, the larger of both: share of the box's longer side, px
-_WITH = (("in", ("top", "legs")), ("with", ("bag", "hat")))
 
 
 @dataclass(frozen=True)
 class SeenFrame:
-    """A frame in numbers: the instance ids and the depth, (h, w) m, of its pixels."""
+    """A frame in numbers."""
 
-    ids: np.ndarray
-    depth: np.ndarray
+    ids: np.ndarray  # (h, w) instance ids
+    depth: np.ndarray  # (h, w) m
 
-    def column_share(self, number: int) -> float:
+    def shows(self, person_id: int) -> bool:
+        return bool((self.ids == person_id).any())
+
+    def column_share(self, person_id: int) -> float:
         """Return the mean column of a person's pixels as a share of the picture's width."""
-        return float(np.nonzero(self.ids == number)[1].mean()) / self.ids.shape[1]
+        return float(np.nonzero(self.ids == person_id)[1].mean()) / self.ids.shape[1]
 
-    def depth_m(self, number: int) -> float:
+    def depth_m(self, person_id: int) -> float:
         """Return the median depth of a person's pixels, m."""
-        return float(np.median(self.depth[self.ids == number]))
+        return float(np.median(self.depth[self.ids == person_id]))
 
 
 def meant(says: Iterable[str], looks: Appearance, people: Mapping[int, Appearance], picture: SeenFrame) -> set[int]:
@@ -50,22 +75,21 @@ def meant(says: Iterable[str], looks: Appearance, people: Mapping[int, Appearanc
     says: the description. looks: appearance for its slots. people: appearance by instance id.
     """
     slots = {*says} - {*SIDES}
-    fitting = {
-        number
-        for number, person in people.items()
-        if not slots & {*looks.differences(person)} and (picture.ids == number).any()
-    }
+    fitting = set()
+    for person_id, person in people.items():
+        if picture.shows(person_id) and slots.isdisjoint(looks.differences(person)):
+            fitting.add(person_id)
     for relation in {*says} - slots:
-        fitting = {number for number, excess in _excess(relation, fitting, picture).items() if excess <= 0.0}
+        fitting = {person_id for person_id, excess in _excess(relation, fitting, picture).items() if excess <= 0.0}
     return fitting
 
 
-def _excess(relation: str, numbers: Collection[int], picture: SeenFrame) -> dict[int, float]:
-    """Return how far each person is from fulfilling a relation, m or shares of the width; 0 or less where it holds."""
-    measure = picture.depth_m if relation in ("near", "far") else picture.column_share
-    sign = SIDES[relation][2]
-    values = {number: sign * measure(number) for number in numbers}
-    return {number: value - min(values.values()) for number, value in values.items()}
+def _excess(relation: str, person_ids: Collection[int], picture: SeenFrame) -> dict[int, float]:
+    """Return how far each person is from fulfilling a relation, m or shares of the width; 0 for who fulfils it."""
+    side = SIDES[relation]
+    measure = picture.depth_m if side.is_depth else picture.column_share
+    values = {person_id: side.sign * measure(person_id) for person_id in person_ids}
+    return {person_id: value - min(values.values()) for person_id, value in values.items()}
 
 
 def find_says(
@@ -74,37 +98,39 @@ def find_says(
 ) -> tuple[str, ...] | None:  # fmt: skip
     """Find the shortest description that only the target (PERSON_ID) fits in a picture; None if there is none.
 
+    A relation is added only if clothing alone fits others too.
+
     tells: (slot, appearance) -> whether the picture shows that the target does not look like that in the slot. shows:
     (slot, id) -> whether it shows that this other person does not look like the target in the slot.
     """
     looks = people[PERSON_ID]
     rivals = {
-        number: person for number, person in people.items() if number != PERSON_ID and (picture.ids == number).any()
+        person_id: person for person_id, person in people.items() if person_id != PERSON_ID and picture.shows(person_id)
     }
     noun = ("figure",) if tells("figure", otherwise(looks, "figure")) else ()
     best_says: tuple[str, ...] | None = None
     best_rivals: set[int] = set()  # rivals that the best description fits too
-    for chosen in (slots for size in range(1, len(SLOTS) + 1) for slots in combinations(SLOTS, size)):
+    for chosen in chain.from_iterable(combinations(SLOTS, size) for size in range(1, len(SLOTS) + 1)):
         says = (*noun, *chosen)
-        differing = {number: {*says} & {*looks.differences(person)} for number, person in rivals.items()}
+        differing = {person_id: {*says} & {*looks.differences(person)} for person_id, person in rivals.items()}
         num_equal = sum(not slots for slots in differing.values())
         if best_says is not None and num_equal >= len(best_rivals):
             continue  # it cannot be better; `tells` renders pictures
-        if all(tells(slot, otherwise(looks, slot)) for slot in chosen):
-            confused = {
-                number
-                for number, slots in differing.items()
-                if not any(tells(slot, rivals[number]) and shows(slot, number) for slot in slots)
-            }
-            if best_says is None or len(confused) < len(best_rivals):
-                best_says = says
-                best_rivals = confused
+        if not all(tells(slot, otherwise(looks, slot)) for slot in chosen):
+            continue
+        confused = set()
+        for person_id, slots in differing.items():
+            if not any(tells(slot, rivals[person_id]) and shows(slot, person_id) for slot in slots):
+                confused.add(person_id)
+        if best_says is None or len(confused) < len(best_rivals):
+            best_says = says
+            best_rivals = confused
     if best_says is None or not best_rivals:
         return best_says
-    for relation, (_, _, _, margin) in SIDES.items():
+    for relation, side in SIDES.items():
         excess = _excess(relation, {PERSON_ID, *best_rivals}, picture)
         target_excess = excess.pop(PERSON_ID)
-        if target_excess <= 0.0 and min(excess.values()) >= margin:
+        if target_excess <= 0.0 and min(excess.values()) >= side.margin:
             return (*best_says, relation)
     return None
 
@@ -126,21 +152,29 @@ def otherwise(looks: Appearance, slot: str) -> Appearance:
 def words_of(says: Sequence[str], looks: Appearance) -> Words:
     """Return the description in both languages."""
     noun = FIGURES[looks.figure] if "figure" in says else {"en": "person", "zh": "行人"}
-    side_en, side_zh, *_ = next((SIDES[name] for name in says if name in SIDES), ("", ""))
+    side: Words = {"en": "", "zh": ""}
+    for name in says:
+        if name in SIDES:
+            side = SIDES[name].words
 
     def worn(slot: str, language: Language) -> str:
-        verb, *bare = SLOTS[slot]
-        if not (color := getattr(looks, f"{slot}_color")):
-            return bare[language == "zh"]
+        color = getattr(looks, f"{slot}_color")
+        words_for_none = SLOTS[slot].none
+        if not color and words_for_none:
+            return words_for_none[language]
         color_word = COLORS[color][0][language]
         garment = GARMENTS[slot][getattr(looks, slot)][language]
-        return f"the {color_word} {garment}" if language == "en" else verb + color_word + garment
+        return f"the {color_word} {garment}" if language == "en" else SLOTS[slot].verb_zh + color_word + garment
 
-    lists = [(word, [worn(slot, "en") for slot in slots if slot in says]) for word, slots in _WITH]
-    phrases = [f"{word} {' and '.join(garments)}" for word, garments in lists if garments]
-    en = " ".join(filter(None, ("the", side_en, noun["en"], *phrases)))
-    phrases_zh = [worn(slot, "zh") for slot in SLOTS if slot in says]
-    return {"en": en, "zh": f"{side_zh}{'、'.join(phrases_zh)}的{noun['zh']}"}
+    phrases = []
+    described = [name for name in SLOTS if name in says]
+    for preposition in ("in", "with"):
+        garments = [worn(slot, "en") for slot in described if SLOTS[slot].preposition == preposition]
+        if garments:
+            phrases.append(f"{preposition} {' and '.join(garments)}")
+    en = " ".join(filter(None, ("the", side["en"], noun["en"], *phrases)))
+    zh = "、".join(worn(slot, "zh") for slot in described)
+    return {"en": en, "zh": f"{side['zh']}{zh}的{noun['zh']}"}
 
 
 def target_picture(rgb: np.ndarray, box: list[float]) -> np.ndarray:

@@ -35,12 +35,12 @@ _CORNER_SIGNS = np.array([[x, y, z] for z in (-1.0, 1.0) for x, y in ((-1, -1), 
 
 @dataclass(frozen=True)
 class OccupancyGrid:
-    """Cells over the ground plane. x_min_m, y_min_m: the low corner of cell (0, 0), world. occupied: (ny, nx) bool."""
+    """Cells over the ground plane."""
 
-    x_min_m: float
+    x_min_m: float  # low corner of cell (0, 0), world
     y_min_m: float
     resolution_m: float
-    occupied: np.ndarray
+    occupied: np.ndarray  # (ny, nx) bool
 
     @property
     def size(self) -> tuple[int, int]:
@@ -63,16 +63,14 @@ class OccupancyGrid:
 def empty_grid(box_map: BoxMap, resolution_m: float = RESOLUTION_M) -> OccupancyGrid:
     """Return a free grid over the bounds of all boxes of any kind."""
     low, high = box_map.bounds()
-    num_x, num_y = (max(1.0, math.ceil((high[k] - low[k] - TOUCH_M) / resolution_m)) for k in (0, 1))
+    num_x, num_y = (max(1, math.ceil((high[k] - low[k] - TOUCH_M) / resolution_m)) for k in (0, 1))
     if num_x * num_y > MAX_CELLS:
-        raise InputError(
-            "the map is too large for an occupancy grid",
-            where=box_map.name,
-            got=f"{num_x:.0f} x {num_y:.0f} cells of {resolution_m} m",
-            expected=f"at most {MAX_CELLS} cells",
-            fix="remove boxes that lie far outside, or set a larger resolution_m",
-        )
-    return OccupancyGrid(float(low[0]), float(low[1]), resolution_m, np.zeros((int(num_y), int(num_x)), dtype=bool))
+        what = "the map is too large for an occupancy grid"
+        got = f"{num_x} x {num_y} cells of {resolution_m} m"
+        expected = f"at most {MAX_CELLS} cells"
+        fix = "remove boxes that lie far outside, or set a larger resolution_m"
+        raise InputError(what, where=box_map.name, got=got, expected=expected, fix=fix)
+    return OccupancyGrid(float(low[0]), float(low[1]), resolution_m, np.zeros((num_y, num_x), dtype=bool))
 
 
 def blocks_walking(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M) -> np.ndarray:
@@ -174,16 +172,17 @@ def _fill_hull(points, count, touch, mark, cells):  # pragma: no cover (compiled
     """Mark the cells that the convex hull of the first `count` points (k, 2), in cells, overlaps.
 
     The part of a convex shape inside one row of cells spans one interval of x, and exactly the cells that meet the
-    interval overlap the shape. The ends of the interval lie on points or on lines between two of them, so the hull is
-    never built.
+    interval overlap the shape. The ends of the interval lie on points or on lines between two points, so the least and
+    the greatest x of these are enough, and the hull is never built.
     """
     num_y = len(cells)
     bottom, top = np.inf, -np.inf
     for i in range(count):
         bottom, top = min(bottom, points[i, 1]), max(top, points[i, 1])
     # Limits are clipped as floats: far points do not fit an integer.
-    first, stop_row = int(max(0.0, np.floor(bottom + touch))), int(max(0.0, min(float(num_y), np.ceil(top - touch))))
-    for row in range(first, stop_row):
+    first_row = int(max(0.0, np.floor(bottom + touch)))
+    stop_row = int(max(0.0, min(float(num_y), np.ceil(top - touch))))
+    for row in range(first_row, stop_row):
         low, high = row + touch, row + 1.0 - touch
         left, right = np.inf, -np.inf
         for i in range(count):

@@ -27,26 +27,23 @@ RAY_OFFSETS_M = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.8], [0.0, 0.0, -0.6], [0
 RAY_SPREAD_M = 0.8  # the longest of the offsets
 CORNER = 3.0**0.5  # times the growth of a rotated box: the largest growth of its axis-aligned bounds
 
-# Columns of BoxIndex.rows; u, v, w are the axes of a box's own frame: x = XU u + XV v + XW w + CENTER_X. Places in
-# BoxIndex.grid.
+# Columns of BoxIndex.rows; u, v, w are the axes of a box's own frame: x = XU u + XV v + XW w + CENTER_X.
 CENTER_X, CENTER_Y, CENTER_Z, HALF_X, HALF_Y, HALF_Z, XU, XV, XW, YU, YV, YW, ZU, ZV, ZW = range(15)
 LOW_X, LOW_Y, LOW_Z, HIGH_X, HIGH_Y, HIGH_Z = range(15, 21)
-ORIGIN_X, ORIGIN_Y, CELL = range(3)
+ORIGIN_X, ORIGIN_Y, CELL = range(3)  # indices into BoxIndex.grid
 
 
 class BoxIndex(NamedTuple):
-    """Oriented boxes and the cells that hold them; k boxes.
+    """k oriented boxes and the cells that hold them.
 
-    rows: (k, 21) m, one box in three cache lines: centre, half extents, world_from_box row by row, low and high corner
-    of the axis-aligned bounds. grid: (3,) low corner of cell (0, 0) and cell size, m. shape: (2,) cells along x and y.
-    starts: (cells + 1,) and members: (m,): cell c = ix * shape[1] + iy holds members[starts[c]:starts[c + 1]].
+    Cell c = ix * shape[1] + iy holds members[starts[c]:starts[c + 1]]. A row has three cache lines.
     """
 
-    rows: np.ndarray
-    grid: np.ndarray
-    shape: np.ndarray
-    starts: np.ndarray
-    members: np.ndarray
+    rows: np.ndarray  # (k, 21) m: centre, half extents, world_from_box row by row, corners of the axis-aligned bounds
+    grid: np.ndarray  # (3,) low corner of cell (0, 0) and cell size, m
+    shape: np.ndarray  # (2,) cells along x and y
+    starts: np.ndarray  # (cells + 1,)
+    members: np.ndarray  # (m,) rows
 
 
 # --- building ---------------------------------------------------------------------------------------------------------
@@ -64,12 +61,13 @@ def index_boxes(
     centers, half_extents, rotations = _points(centers), _points(half_extents), _points(rotations)
     spans = np.einsum("kij,kj->ki", np.abs(rotations), half_extents)
     mins, maxs = centers - spans, centers + spans
-    low, high = (mins[:, :2].min(axis=0), maxs[:, :2].max(axis=0)) if len(centers) else (np.zeros(2), np.zeros(2))
-    size = high - low
-    while np.prod(np.floor(size / cell_m) + 1) > MAX_CELLS:
+    low = mins[:, :2].min(axis=0) if len(centers) else np.zeros(2)
+    high = maxs[:, :2].max(axis=0) if len(centers) else np.zeros(2)
+    while np.prod(np.floor((high - low) / cell_m) + 1) > MAX_CELLS:
         cell_m *= 2.0
-    shape = (np.floor(size / cell_m) + 1).astype(np.int64)
-    first, last = (np.floor((ends[:, :2] - low) / cell_m).astype(np.int64).clip(0, shape - 1) for ends in (mins, maxs))
+    shape = (np.floor((high - low) / cell_m) + 1).astype(np.int64)
+    first = np.floor((mins[:, :2] - low) / cell_m).astype(np.int64).clip(0, shape - 1)
+    last = np.floor((maxs[:, :2] - low) / cell_m).astype(np.int64).clip(0, shape - 1)
     starts, members = _fill_cells(first, last, shape)
     rows = np.column_stack([centers, half_extents, rotations.reshape(-1, 9), mins, maxs])
     return BoxIndex(np.ascontiguousarray(rows), np.array([low[0], low[1], cell_m]), shape, starts, members)
@@ -82,12 +80,12 @@ def obstacle_index(box_map: BoxMap) -> BoxIndex:
 
 
 def _fill_cells(first: np.ndarray, last: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return starts and members: the boxes of each cell, in order. first, last: (k, 2) cells of a box."""
+    """Return starts and members of BoxIndex, the boxes of a cell in order. first, last: (k, 2) cells of a box."""
     spans = last - first + 1
     counts = spans.prod(axis=1)
-    boxes = np.repeat(np.arange(len(first)), counts)
-    place = np.arange(len(boxes)) - np.repeat(np.cumsum(counts) - counts, counts)  # among the cells of its box
-    along_x, along_y = np.divmod(place, spans[boxes, 1])
+    boxes = np.repeat(np.arange(len(first)), counts)  # one entry for each cell of each box
+    cell_of_box = np.arange(len(boxes)) - np.repeat(np.cumsum(counts) - counts, counts)  # from 0 for each box
+    along_x, along_y = np.divmod(cell_of_box, spans[boxes, 1])
     cells = (first[boxes, 0] + along_x) * shape[1] + first[boxes, 1] + along_y
     starts = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=int(shape.prod())))])
     return starts, boxes[np.argsort(cells, kind="stable")]
@@ -181,7 +179,10 @@ def clip(origin, direction, half, enter, leave):
 
 @njit(cache=True, inline="always")
 def touches(rows, box, a, b, c, u, v, w, inflate_m):
-    """Return whether a segment in a box's frame touches the box grown by `inflate_m` (slabs, Kay and Kajiya 1986)."""
+    """Return whether a segment from (a, b, c) to (u, v, w) in a box's frame touches the box grown by `inflate_m`.
+
+    Source: Slab method, Kay and Kajiya 1986.
+    """
     enter, leave = clip(a, u - a, rows[box, HALF_X] + inflate_m, 0.0, 1.0)
     enter, leave = clip(b, v - b, rows[box, HALF_Y] + inflate_m, enter, leave)
     enter, leave = clip(c, w - c, rows[box, HALF_Z] + inflate_m, enter, leave)
@@ -206,20 +207,22 @@ def segment_hits_box(rows, box, ax, ay, az, bx, by, bz, inflate_m):
 def segment_to_box(rows, box, ax, ay, az, bx, by, bz):
     """Return the least distance of a segment to a box, m, 0 where it touches, and the share of its way where that is.
 
-    Along a line the squared distance is convex, and a parabola between the places where it crosses the planes of the
-    six faces: its slope is straight there, and zero where the distance is least.
+    Along a line the squared distance is convex, and a parabola between the points where it crosses the planes of the
+    six faces: its slope is linear there, and zero where the distance is least. So the slope is computed at these points
+    and at both ends; `low` and `high` become the last share with a falling and the first with a rising distance.
     """
     u, v, w = in_box_frame(rows, box, ax, ay, az)
     p, q, r = turned(rows, box, bx - ax, by - ay, bz - az)
     starts, ways = (u, v, w), (p, q, r)
     low, low_slope, high, high_slope = 0.0, -np.inf, 1.0, np.inf
-    for place in range(8):
-        share = float(place - 6)  # both ends too
-        if place < 6:
-            axis = place // 2
+    for candidate in range(8):  # 0 to 5: the faces, two on each axis; 6 and 7: the ends
+        share = float(candidate - 6)
+        if candidate < 6:
+            axis = candidate // 2
             if abs(ways[axis]) < 1e-12:
                 continue
-            share = ((1 - 2 * (place % 2)) * rows[box, HALF_X + axis] - starts[axis]) / ways[axis]
+            side = 1 - 2 * (candidate % 2)
+            share = (side * rows[box, HALF_X + axis] - starts[axis]) / ways[axis]
             if not 0.0 < share < 1.0:
                 continue
         slope = 0.0
@@ -449,9 +452,9 @@ def _points(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
-def distances_to_boxes_m(points_m: np.ndarray, other: Bystander) -> np.ndarray:
+def distances_to_boxes_m(points_m: np.ndarray, bystander: Bystander) -> np.ndarray:
     """Return the distance of a point, (n, 3), from the box of a bystander at each time, (n,) m, 0 inside."""
-    offset = points_m - other.centers_m
-    cos, sin = np.cos(other.headings_rad), np.sin(other.headings_rad)
+    offset = points_m - bystander.centers_m
+    cos, sin = np.cos(bystander.headings_rad), np.sin(bystander.headings_rad)
     local = np.stack([offset[:, 0] * cos + offset[:, 1] * sin, offset[:, 1] * cos - offset[:, 0] * sin, offset[:, 2]])
     return np.linalg.norm(np.maximum(np.abs(local) - np.array(PERSON_HALF_EXTENTS_M)[:, None], 0.0), axis=0)

@@ -17,9 +17,8 @@ LEAST_SEEN = 150  # points; a share of fewer is not reported
 LEAST_PLANES = 30  # points; the depth error of fewer is not reported
 SEEN, AGREE, MISSING, SAME = range(4)  # indices of the counts of `_reproject`; names as in `Agreement`
 # Kinds of objects that may be elsewhere in the next frame, (256,) bool by kind.
-MOVING = np.isin(np.arange(256), [KINDS[kind] for kind in (
-    "Pedestrians", "Rider", "Car", "Truck", "Bus", "Train", "Motorcycle", "Bicycle", "Dynamic",
-)])  # fmt: skip
+_MOVING_KINDS = ("Pedestrians", "Rider", "Car", "Truck", "Bus", "Train", "Motorcycle", "Bicycle", "Dynamic")
+MOVING = np.isin(np.arange(256), [KINDS[kind] for kind in _MOVING_KINDS])
 # Kinds of surfaces that people and cars stand on, and water. Maps have several in one plane (two roads at their
 # crossing), where a renderer's rounding decides the id pixel by pixel, so only their kind is compared.
 FLAT = np.isin(np.arange(256), [*GROUND_KINDS, KINDS["Water"]])
@@ -69,13 +68,18 @@ def compare_views(a: View, b: View, intrinsics_a: np.ndarray, intrinsics_b: np.n
     counts_back, *_ = _reproject(b.depth, b.instance, a.depth, a.instance, k_b, k_a, b_from_a.T, b_in_a_m)
     missing_shares = [c[MISSING] / c[SEEN] for c in (counts, counts_back) if c[SEEN] >= LEAST_SEEN]
     return Agreement(
-        seen=int(counts[SEEN]), agree=int(counts[AGREE]), same=int(counts[SAME]), error=_error_of(errors),
-        error_flat=_error_of(errors[~is_off_flat]), error_off_flat=_error_of(errors[is_off_flat]),
+        seen=int(counts[SEEN]),
+        agree=int(counts[AGREE]),
+        same=int(counts[SAME]),
+        error=_error_of(errors),
+        error_flat=_error_of(errors[~is_off_flat]),
+        error_off_flat=_error_of(errors[is_off_flat]),
         missing_share=float(max(missing_shares, default=0.0)),
-    )  # fmt: skip
+    )
 
 
 def _error_of(errors: np.ndarray) -> float:
+    """Return the median; NaN of too few errors."""
     return float(np.median(errors)) if len(errors) >= LEAST_PLANES else np.nan
 
 
@@ -182,10 +186,11 @@ def _error_on_plane(depth, u, v, depth_m):  # type: ignore[no-untyped-def]
     """
     x, y = int(np.floor(u - 0.5)), int(np.floor(v - 0.5))
     right, down = u - 0.5 - x, v - 0.5 - y  # weights of the right column and of the lower row
-    d00, d01, d10, d11 = float(depth[y, x]), float(depth[y, x + 1]), float(depth[y + 1, x]), float(depth[y + 1, x + 1])
-    if min(d00, d01, d10, d11) <= 0.0:  # invalid
+    if min(depth[y, x], depth[y, x + 1], depth[y + 1, x], depth[y + 1, x + 1]) <= 0.0:  # invalid
         return np.nan
-    q00, q01, q10, q11 = 1.0 / d00, 1.0 / d01, 1.0 / d10, 1.0 / d11
+    # Inverse depths: row, column.
+    q00, q01 = 1.0 / float(depth[y, x]), 1.0 / float(depth[y, x + 1])
+    q10, q11 = 1.0 / float(depth[y + 1, x]), 1.0 / float(depth[y + 1, x + 1])
     if not abs(q00 + q11 - q01 - q10) < PLANE_SHARE / depth_m:
         return np.nan
     q = (1 - down) * ((1 - right) * q00 + right * q01) + down * ((1 - right) * q10 + right * q11)

@@ -2,7 +2,7 @@
 
 Two tracks of one pedestrian trajectory show the same places at the same times, even with other names, planners, runs or
 builds of the town: a student that was trained on one of them has seen the answers to the other. So training sets and
-releases assign whole groups, called walks here. This module handles positions and names only, no files.
+releases assign whole groups, called walks here. A course is the target's motion in one track.
 """
 
 from __future__ import annotations
@@ -28,16 +28,12 @@ ON_TIME_S = 1e-3  # a point this close to a full second counts as at that second
 
 @dataclass(frozen=True)
 class Course:
-    """The target's positions in a track, without any perturbation.
+    """The target's positions in a track, without any perturbation."""
 
-    name: `run/town/trajectory`; courses with the same name always belong to one walk. time_s: (n,) s,
-    increasing. target_m: (n, 3) m, right-handed, NaN where unknown.
-    """
-
-    name: str
+    name: str  # `run/town/trajectory`; courses with the same name always belong to one walk
     town: str
-    time_s: np.ndarray
-    target_m: np.ndarray
+    time_s: np.ndarray  # (n,) s, increasing
+    target_m: np.ndarray  # (n, 3) m, right-handed, NaN where unknown
 
     def at_seconds(self) -> Course:
         """Return the course interpolated at full seconds, except in gaps longer than MOST_GAP_S."""
@@ -51,8 +47,9 @@ class Course:
         gaps_s = time_s[after[inside]] - time_s[before[inside]]
         seconds = seconds[inside][gaps_s <= MOST_GAP_S]
         target_m = np.empty((len(seconds), 3))
-        for axis in range(3) if len(seconds) else ():
-            target_m[:, axis] = np.interp(seconds, time_s, places_m[:, axis])
+        if len(seconds):
+            for axis in range(3):
+                target_m[:, axis] = np.interp(seconds, time_s, places_m[:, axis])
         return Course(self.name, self.town, seconds, target_m)
 
 
@@ -91,15 +88,16 @@ def _near_pairs(courses: list[Course]) -> list[tuple[str, str]]:
     """Return the names of the pairs of courses that are near each other for long enough."""
     from scipy.spatial import cKDTree
 
-    owners = np.repeat(np.arange(len(courses)), [len(course.time_s) for course in courses])
+    # One entry for each second of each course: the index of the course, the second and the place.
+    course_indices = np.repeat(np.arange(len(courses)), [len(course.time_s) for course in courses])
     seconds = np.concatenate([course.time_s for course in courses])
     places_m = np.concatenate([course.target_m[:, :2] for course in courses])
     order = np.argsort(seconds, kind="stable")
-    num_near: dict[tuple[int, int], int] = defaultdict(int)
+    num_near: dict[tuple[int, int], int] = defaultdict(int)  # seconds in which two courses are near
     for same_second in np.split(order, np.flatnonzero(np.diff(seconds[order])) + 1):
         if len(same_second) > 1:
             near = cKDTree(places_m[same_second]).query_pairs(NEAR_M, output_type="ndarray")
-            for i, j in np.sort(owners[same_second][near]).tolist():
+            for i, j in np.sort(course_indices[same_second][near]).tolist():
                 num_near[i, j] += 1
     pairs = []
     for (i, j), count in num_near.items():
@@ -126,14 +124,13 @@ def assign_splits(groups: Iterable[str], fractions: Mapping[Split, float], seed:
     requested = [split for split in SPLITS if split == "train" or fractions.get(split, 0.0) > 0]
     if len(ranked) < len(requested):
         return dict(zip(ranked, requested, strict=False))
-    num_test, num_val = (
-        max(1, round(share * len(ranked))) if share else 0
-        for share in (fractions.get("test", 0.0), fractions.get("val", 0.0))
-    )
-    while num_test + num_val >= len(ranked):  # rounding left none for train: the larger split loses one
-        if num_test >= num_val:
-            num_test -= 1
-        else:
-            num_val -= 1
-    counts: dict[Split, int] = {"test": num_test, "val": num_val, "train": len(ranked) - num_test - num_val}
-    return dict(zip(ranked, (split for split, count in counts.items() for _ in range(count)), strict=True))
+    counts: dict[Split, int] = {"test": 0, "val": 0}
+    for split in counts:
+        share = fractions.get(split, 0.0)
+        if share:
+            counts[split] = max(1, round(share * len(ranked)))
+    while sum(counts.values()) >= len(ranked):  # rounding left none for train: the larger split loses one
+        counts["test" if counts["test"] >= counts["val"] else "val"] -= 1
+    counts["train"] = len(ranked) - sum(counts.values())
+    splits = [split for split, count in counts.items() for _ in range(count)]
+    return dict(zip(ranked, splits, strict=True))

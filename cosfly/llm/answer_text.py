@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 
-from cosfly.formats.captions import BY_LETTERS, FIELDS, TOKENS, Coc, Language, Place, fields_in_order
+from cosfly.formats.captions import BY_LETTERS, FIELDS, TOKENS, Coc, Language, Place
 from cosfly.runtime.model_json import find_object
 
 _DECISION = re.compile(r"""[\s"'`*]*(?P<action>[a-z]+(?:[\s_-]+[a-z]+)*)[\s"'`*.]*""")
@@ -19,8 +19,10 @@ MAX_CHARACTERS = {"critical_components": 1200, "reasoning_trace": 1600}  # a ser
 
 
 def normalize_action(text: str) -> str | None:
-    """Return the action token in any case, with spaces, hyphens or quotes; None for other text."""
-    match = _DECISION.fullmatch(text.lower()) if len(text) <= MAX_DECISION_CHARACTERS else None
+    """Return the token of an action that is written in any case, with spaces, hyphens or quotes; else None."""
+    if len(text) > MAX_DECISION_CHARACTERS:
+        return None
+    match = _DECISION.fullmatch(text.lower())
     return BY_LETTERS.get(re.sub(r"[\s_-]", "", match["action"])) if match else None
 
 
@@ -39,8 +41,8 @@ def answer_schema(
         for name, characters in _min_characters(language).items()
     }
     properties |= more
-    properties["flight_decision"] = {"type": "string", "enum": [decision] if decision else list(TOKENS)}
-    return object_schema({name: properties[name] for name in dict.fromkeys([*fields_in_order(place)[:1], *properties])})
+    decision_schema = {"flight_decision": {"type": "string", "enum": [decision] if decision else list(TOKENS)}}
+    return object_schema(decision_schema | properties if place == "first" else properties | decision_schema)
 
 
 def object_schema(properties: Mapping[str, dict]) -> dict:
@@ -54,16 +56,12 @@ def _min_characters(language: Language) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Parsed:
-    """A checked answer.
+    """A checked answer."""
 
-    coc: The answer; None if its structure is wrong. reason: The problem then. recovered: Wrappings that were removed.
-    therefore: The action in that field, if the prompt asks for it.
-    """
-
-    coc: Coc | None
-    reason: str | None = None
-    recovered: tuple[str, ...] = ()
-    therefore: str | None = None
+    coc: Coc | None  # None if its structure is wrong
+    reason: str | None = None  # the problem of the structure
+    recovered: tuple[str, ...] = ()  # wrappings that were removed
+    therefore: str | None = None  # the action in that field, if the prompt asks for it
 
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
@@ -91,9 +89,10 @@ def parse_answer(
     """
     names = (*FIELDS, *more)
     answer = find_object(text, names, finish_reason)
-    if (value := answer.value) is None:
+    value = answer.value
+    if value is None:
         return Parsed(None, answer.reason, answer.recovered)
-    if len(value) != len(names) or not all(map(value.__contains__, names)):
+    if value.keys() != set(names):
         return Parsed(None, "missing_field" if set(names) - value.keys() else "extra_field", answer.recovered)
     texts = [value[name] for name in FIELDS]
     if not all(isinstance(text, str) for text in texts):
@@ -101,12 +100,14 @@ def parse_answer(
     plain = [_CONTROL.sub("", text) for text in texts]
     recovered = answer.recovered if plain == texts else (*answer.recovered, "control_characters")
     cleaned = {name: text.strip() for name, text in zip(FIELDS, plain, strict=True)}
-    if (reason := _problem_of(cleaned, language)) is not None:
+    reason = _problem_of(cleaned, language)
+    if reason is not None:
         return Parsed(None, reason, recovered)
-    if (action := normalize_action(cleaned["flight_decision"])) is None:
+    action = normalize_action(cleaned["flight_decision"])
+    if action is None:
         return Parsed(None, "decision_not_in_closed_set", recovered)
-    stated = value.get("therefore")
-    therefore = normalize_action(stated) if isinstance(stated, str) else None
+    therefore_text = value.get("therefore")
+    therefore = normalize_action(therefore_text) if isinstance(therefore_text, str) else None
     if therefore is None and "therefore" in names:
         return Parsed(None, "therefore_not_in_closed_set", recovered)
     return Parsed(Coc(**cleaned | {"flight_decision": action}), None, recovered, therefore)
@@ -147,6 +148,7 @@ def is_in_script(text: str, language: Language) -> bool:
 # A full stop after these abbreviations or inside a number does not end a sentence.
 _ABBREVIATIONS = ("approx", "ca", "vs", "deg", "i\\.e", "e\\.g", "resp", "max", "min", "avg", "horiz")
 _POINT = r"(?<=\.)(?=\s|$)" + "".join(rf"(?<!\b(?i:{word})\.)" for word in _ABBREVIATIONS)
+# The end of a sentence: "right. ", "右转。", "really?!", a line break; not within "2.5 m" or "e.g. a car".
 # The pattern begins with one character class, which the regex engine searches twice as fast as alternatives.
 _MARKS = ".。！？!?\n"
 END = re.compile(rf"[{_MARKS}](?:(?<=[。！？!?])[。！？!?]*|(?<=\n)|{_POINT})\s*")

@@ -38,7 +38,7 @@ _PLAIN_NAME = re.compile(r"\w[\w.+-]*")
 
 
 class Answer(BaseModel):
-    """A line of a journal. usage: Empty if the server reports none."""
+    """A line of a journal."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
@@ -47,11 +47,11 @@ class Answer(BaseModel):
     purpose: str
     model: str = ""
     text: str
-    usage: dict[CountName, Annotated[int, Field(strict=True, ge=0, le=MOST_TOKENS)]]
+    usage: dict[CountName, Annotated[int, Field(strict=True, ge=0, le=MOST_TOKENS)]]  # empty if none is reported
     structured: str = ""
     finish_reason: str | None = None
     latency_s: float = Field(0.0, ge=0)
-    time: float = 0.0
+    time: float = 0.0  # seconds since 1970
 
     @property
     def reply(self) -> Reply:
@@ -62,13 +62,13 @@ class Answer(BaseModel):
 
 def answer_key(model: str, request: Request) -> str:
     """Return the digest of all that determines an answer: image bytes, prompt, model, sampling and schema."""
-    texts = [
-        message
-        if isinstance(message["content"], str)
-        else message | {"content": [part.get("text", "image") for part in message["content"]]}
-        for message in request.messages
-    ]
-    parts = [texts, request.digests, {"model": model, **request.sampling}, request.schema]
+    messages = []  # without the pictures
+    for message in request.messages:
+        content = message["content"]
+        if not isinstance(content, str):
+            content = [part.get("text", "image") for part in content]
+        messages.append(message | {"content": content})
+    parts = [messages, request.digests, {"model": model, **request.sampling}, request.schema]
     return sha256_bytes(dump_json(parts).encode())
 
 
@@ -204,41 +204,39 @@ class Budget:
     async def request(self) -> AsyncIterator[None]:
         """Wait for a slot; raises BudgetSpent if a limit is reached."""
         async with self._slots:
-            totals, cfg = self.totals, self.cfg
-            tokens = totals["prompt_tokens"] + totals["completion_tokens"]
-            cost = cfg.cost(totals["prompt_tokens"], totals["completion_tokens"])
-            used = None
-            if cfg.max_tokens is not None and tokens >= cfg.max_tokens:
-                name, used = "max_tokens", f"{tokens:,} of {cfg.max_tokens:,} tokens are used"
-            elif cfg.max_cost is not None and cost >= cfg.max_cost:
-                name, used = "max_cost", f"{cost:.4f} of {cfg.max_cost:g} is spent"
-            if used is not None:
-                fix = "raise it and run the same command again"
-                raise BudgetSpent(f"the limit is reached: {used}", where=f"caption.budget.{name}", fix=fix)
+            self._check_limits()
             yield
+
+    def _check_limits(self) -> None:
+        cfg = self.cfg
+        totals = self.totals
+        tokens = totals["prompt_tokens"] + totals["completion_tokens"]
+        cost = cfg.cost(totals["prompt_tokens"], totals["completion_tokens"])
+        fix = "raise it and run the same command again"
+        if cfg.max_tokens is not None and tokens >= cfg.max_tokens:
+            what = f"the limit is reached: {tokens:,} of {cfg.max_tokens:,} tokens are used"
+            raise BudgetSpent(what, where="caption.budget.max_tokens", fix=fix)
+        if cfg.max_cost is not None and cost >= cfg.max_cost:
+            what = f"the limit is reached: {cost:.4f} of {cfg.max_cost:g} is spent"
+            raise BudgetSpent(what, where="caption.budget.max_cost", fix=fix)
 
     def check(self, usage: Usage | None, where: str) -> None:
         """Raise TeacherError if a limit is set and an answer has no usage."""
         if usage is None and (self.cfg.max_cost is not None or self.cfg.max_tokens is not None):
-            raise TeacherError(
-                "the endpoint does not report token usage, so a limit on tokens or cost cannot be applied",
-                where=where,
-                fix="remove --max-cost and --max-tokens, and limit the number of windows with --limit",
-            )
+            what = "the endpoint does not report token usage, so a limit on tokens or cost cannot be applied"
+            fix = "remove --max-cost and --max-tokens, and limit the number of windows with --limit"
+            raise TeacherError(what, where=where, fix=fix)
 
 
 @dataclass
 class KeptAnswers:
-    """An engine with a journal and a budget: recorded answers are reused, new ones are recorded.
-
-    book: None records nothing. budget: None sets no limit. retried: Ids of the samples that are asked again where a
-    recorded answer had filled the context or declined. listener: Called with each sample id, request and reply.
-    """
+    """An engine with a journal and a budget: recorded answers are reused, new ones are recorded."""
 
     engine: Engine
-    book: AnswerBook | None
-    budget: Budget | None = None
-    retried: frozenset[str] = frozenset()
+    book: AnswerBook | None  # None records nothing
+    budget: Budget | None = None  # None sets no limit
+    retried: frozenset[str] = frozenset()  # samples to ask again if the recorded answer filled the context or declined
+    # Called with each sample id, request and reply.
     listener: Callable[[str, Request, Reply], None] = lambda sample_id, request, reply: None
     _asking: WeakValueDictionary[str, asyncio.Lock] = field(default_factory=WeakValueDictionary)  # by key
 

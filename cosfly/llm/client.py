@@ -13,7 +13,7 @@ import random
 import re
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterable
 from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
@@ -36,8 +36,8 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # the pause after a failed try doubl
 LOADING, LOADING_PAUSE_S = "loading", 5.0  # a server that loads its model is waited for; this is no failed try
 FIRST_LIMIT = 2  # requests in flight until the first answer: a small server answers one after the other
 HEADROOM = 1 / 3  # more requests are sent while answers take less than this share of the time limit
-# A server cuts prompts if so many token counts in a row are equal, though the texts differ by so many characters. Texts
-# that differ in a few digits count equal tokens anyway: many tokenizers make one token of up to three digits.
+# A server cuts prompts if NUM_EQUAL_PROMPTS token counts in a row are equal, though the texts differ by LEAST_SPREAD
+# characters. A few digits may differ: many tokenizers make one token of up to three digits.
 NUM_EQUAL_PROMPTS, LEAST_SPREAD = 8, 50
 MOST_REPLY_MB = 4.0  # of one answer, uncompressed
 MOST_ERROR_TEXT = 300  # characters of a server's error text; the rest is dropped
@@ -51,7 +51,9 @@ _tls = functools.cache(httpx.create_ssl_context)  # certificates are read once: 
 
 
 class EndpointConfig(Config):
-    # Settings in messages -> what they are called here.
+    """Sampling and limits of requests to a server."""
+
+    # Messages name the settings of `caption.endpoint`. A subclass lists the names of its own settings for them.
     own_names: ClassVar[dict[str, str]] = {" or distill.prepare.modalities=[]": ""}
     model: str | None = Field(None, description="name of the model; empty: the endpoint's only model")
     temperature: float = Field(0.6, ge=0, le=2, description="sampling temperature; 0 is greedy")
@@ -81,20 +83,21 @@ class EndpointConfig(Config):
 class ConcurrencyLimit:
     """A limit on requests in flight, which finds what a server can take.
 
-    It begins low and is raised by one per answer until the server is busy for the first time; then it is halved, and
-    raised by one per round of answers. A server that is busy at FIRST_LIMIT is starting, so this does not count as the
-    first time. The limit is not raised while answers are slow: a server with one slot answers no sooner if more
-    requests wait in its queue, and they would time out there. A Retry-After holds back all requests, not only the one
-    that received it.
+    - It begins low and is raised by one per answer, so that it doubles per round of answers, until the server is busy
+      for the first time. Then it is halved, and raised by one per round. A server that is busy at FIRST_LIMIT is
+      starting, so this does not count as the first time.
+    - It is not raised while answers are slow: a server with one slot answers no sooner if more requests wait in its
+      queue, and they would time out there.
+    - A Retry-After holds back all requests, not only the one that received it.
     """
 
     def __init__(self, ceiling: int) -> None:
         self.ceiling = ceiling
         self.limit = float(min(ceiling, FIRST_LIMIT))
         self.num_active = 0
-        self._doubles = True  # per round of answers
-        self._held_until_s = 0.0
-        self._decreased_s = -math.inf
+        self._doubles = True
+        self._held_until_s = 0.0  # of a Retry-After
+        self._decreased_s = -math.inf  # time of the last decrease
         self._changed = asyncio.Condition()
 
     @contextlib.asynccontextmanager
@@ -116,7 +119,8 @@ class ConcurrencyLimit:
     def succeeded(self, is_quick: bool) -> None:
         """Record an answer; a slow one does not raise the limit."""
         if is_quick:
-            self.limit = min(float(self.ceiling), self.limit + (1.0 if self._doubles else 1.0 / self.limit))
+            increase = 1.0 if self._doubles else 1.0 / self.limit
+            self.limit = min(float(self.ceiling), self.limit + increase)
 
     def was_busy(self, sent_s: float, retry_after_s: float | None) -> None:
         """Record that the server is overloaded. Requests sent before the last decrease do not count again."""
@@ -140,22 +144,21 @@ class ChatClient:
             protocol.check_url(url)
         except ValueError as error:
             raise TeacherError(str(error)) from None
-        self.url = self.where = protocol.base_url(url)
+        self.url = protocol.base_url(url)
+        self.where = self.url  # for messages
         self.cfg = cfg
-        self.model = ""
-        self.num_failed, self._warned_s = 0, -math.inf  # failed tries, and when one was last reported
+        self.model = ""  # known after `start`
+        self.num_failed = 0  # tries
+        self._warned_s = -math.inf  # time of the last report of a failed try
         self.concurrency = ConcurrencyLimit(cfg.concurrency)
         self.context: int | None = None  # most tokens of prompt and answer together, if the server reports it
         self.left_out: dict[Kind, Refusal] = {}  # what requests are sent without, and the refusals that say why
-        self._told = set[str]()  # what was reported once
-        self._prompts: dict[int, deque[tuple[int, int]]] = {}  # tokens and characters of the last, by pictures
+        self._logged_topics = set[str]()  # by `_log_once`
+        self._prompt_sizes: dict[int, deque[tuple[int, int]]] = {}  # by pictures: (tokens, characters) of the last
         self._key = os.environ.get(KEY_VARIABLE, "")
         if not (self._key.isascii() and self._key.isprintable()):  # an error of httpx would quote it
-            raise TeacherError(
-                "the API key contains a character that an HTTP header must not contain, such as a line break",
-                where=KEY_VARIABLE,
-                fix="set this environment variable to the key alone",
-            )
+            what = "the API key contains a character that an HTTP header must not contain, such as a line break"
+            raise TeacherError(what, where=KEY_VARIABLE, fix="set this environment variable to the key alone")
         self._free = [self._connect()]
         self._jitter = random.Random()  # for retry pauses only: no product depends on it
 
@@ -171,7 +174,9 @@ class ChatClient:
 
         NoAnswer: The tries or the time are used up, or the server refuses it. TeacherError: All requests will fail.
         """
-        num_tries, longest_s, deadline_s = 0, FIRST_PAUSE_S, math.inf
+        num_tries = 0
+        longest_pause_s = FIRST_PAUSE_S
+        deadline_s = math.inf  # set when the first try has a slot
         while True:
             try:
                 async with self.concurrency.slot():
@@ -182,9 +187,10 @@ class ChatClient:
                 if error.is_final:
                     raise
                 failure = error
-            pause_s = self._jitter.uniform(0.5, 1.0) * longest_s if failure.wait_s is None else failure.wait_s
+            pause_s = self._jitter.uniform(0.5, 1.0) * longest_pause_s if failure.wait_s is None else failure.wait_s
             if failure.cause != LOADING:
-                num_tries, longest_s = num_tries + 1, min(LONGEST_PAUSE_S, 2.0 * longest_s)
+                num_tries += 1
+                longest_pause_s = min(LONGEST_PAUSE_S, 2.0 * longest_pause_s)
             is_last = num_tries >= self.cfg.max_tries
             is_late = time.monotonic() + pause_s >= deadline_s
             self._warn(failure.detail, "giving up" if is_last or is_late else "trying again")
@@ -197,7 +203,7 @@ class ChatClient:
 
     async def _try(self, request: Request, sent_s: float) -> Reply:
         """Try once to get the answer of a request; NoAnswer fails this try, TeacherError all requests."""
-        self._tell_once("sent", logging.INFO, f"the first request is sent, with a limit of {self.cfg.timeout_s:g} s")
+        self._log_once("sent", logging.INFO, f"the first request is sent, with a limit of {self.cfg.timeout_s:g} s")
         try:
             reply = await self.ask(request)
         except (TimeoutError, httpx.RequestError) as error:  # also a compressed body
@@ -209,16 +215,19 @@ class ChatClient:
             raise NoAnswer("bad_reply", str(error)) from None
         except Refusal as refusal:
             raise self._refused(refusal, sent_s) from None
-        seconds = time.monotonic() - sent_s
+        self._adapt_limit(time.monotonic() - sent_s)
+        self._watch_prompts(reply, request)
+        return self._with_full_context(reply, request)
+
+    def _adapt_limit(self, seconds: float) -> None:
+        """Raise the limit on requests in flight after an answer, unless it took long."""
         is_quick = seconds < HEADROOM * self.cfg.timeout_s
         self.concurrency.succeeded(is_quick)
         num_at_once = int(self.concurrency.limit)
         if not is_quick and num_at_once < self.cfg.concurrency:
             limit = f"at most {num_at_once} requests are sent at once until answers take less than a third of "
             limit += self._named("caption.endpoint.timeout_s; raise it if the server can answer more requests at once")
-            self._tell_once("slow", logging.INFO, f"an answer took {seconds:.0f} s, so {limit}")
-        self._watch_prompts(reply, request)
-        return self._with_full_context(reply, request)
+            self._log_once("slow", logging.INFO, f"an answer took {seconds:.0f} s, so {limit}")
 
     async def ask(self, request: Request, on_send: Callable[[], None] = lambda: None) -> Reply:
         """Send a request once, and again without what the server refuses of it: a schema, a system role.
@@ -247,7 +256,8 @@ class ChatClient:
             except Refusal as refusal:
                 refusal.message = self._clean(refusal.message)
                 has_system = with_system and request.messages[0]["role"] == "system"
-                if not {"schema": with_schema, "no_system": has_system}.get(refusal.kind):
+                may_omit = {"schema": with_schema, "no_system": has_system}.get(refusal.kind, False)
+                if not may_omit:
                     if refusal.kind == "pictures":
                         refusal.message += f" (the request has {len(body) / 1e6:.1f} MB)"
                     raise
@@ -255,13 +265,13 @@ class ChatClient:
             else:
                 for kind, cause in refused.items():  # the answer shows that the server refuses it of all requests
                     self.left_out[kind] = cause
-                    self._tell_once(kind, logging.WARNING, LEFT_OUT[kind] % cause)
+                    self._log_once(kind, logging.WARNING, LEFT_OUT[kind] % cause)
                 return reply
 
-    def _tell_once(self, topic: str, level: int, message: str) -> None:
-        """Write a line about a topic to the log, once."""
-        if topic not in self._told:
-            self._told.add(topic)
+    def _log_once(self, topic: str, level: int, message: str) -> None:
+        """Write the first line about a topic to the log."""
+        if topic not in self._logged_topics:
+            self._logged_topics.add(topic)
             log.log(level, "%s: %s", self.where, message)
 
     def _warn(self, detail: str, action: str) -> None:
@@ -275,17 +285,16 @@ class ChatClient:
         """Return the error of a refused request: NoAnswer for this try or this request, TeacherError for all."""
         if refusal.meaning.ends_run:
             return self._error(refusal.meaning.what, got=str(refusal), fix=self.fix_of(refusal.meaning))
-        if refusal.may_pass:
-            if refusal.is_loading:
-                return NoAnswer(LOADING, str(refusal), wait_s=LOADING_PAUSE_S)
-            # A longer wait ends this request, but does not delay the others.
-            wait_s = refusal.wait_s
-            is_long = wait_s is not None and wait_s > TOTAL_TIMEOUT_S
-            if refusal.status in BUSY_STATUS:
-                self.concurrency.was_busy(sent_s, None if is_long else wait_s)
-            asked = f" (the server asks to wait {wait_s:.0f} s)" if is_long else ""
-            return NoAnswer(f"http_{refusal.status}", f"{refusal}{asked}", wait_s=wait_s)
-        return NoAnswer(refusal.code, str(refusal), fix=self.fix_of(refusal.meaning), is_final=True)
+        if not refusal.may_pass:
+            return NoAnswer(refusal.code, str(refusal), fix=self.fix_of(refusal.meaning), is_final=True)
+        if refusal.is_loading:
+            return NoAnswer(LOADING, str(refusal), wait_s=LOADING_PAUSE_S)
+        wait_s = refusal.wait_s
+        is_long = wait_s is not None and wait_s > TOTAL_TIMEOUT_S  # ends this request, but does not delay the others
+        if refusal.status in BUSY_STATUS:
+            self.concurrency.was_busy(sent_s, None if is_long else wait_s)
+        asked = f" (the server asks to wait {wait_s:.0f} s)" if is_long else ""
+        return NoAnswer(f"http_{refusal.status}", f"{refusal}{asked}", wait_s=wait_s)
 
     def _with_full_context(self, reply: Reply, request: Request) -> Reply:
         """Mark an answer that the server cut before `max_tokens` because its context is full.
@@ -301,28 +310,56 @@ class ChatClient:
             return reply
         problem = f"an answer was cut after {usage.completion_tokens} of {most} tokens"
         meaning = MEANINGS["too_long"]
-        self._tell_once("context", logging.WARNING, f"{problem}: {meaning.what}; {self.fix_of(meaning)}")
+        self._log_once("context", logging.WARNING, f"{problem}: {meaning.what}; {self.fix_of(meaning)}")
         return replace(reply, finish_reason=CONTEXT_FULL)
 
     def _watch_prompts(self, reply: Reply, request: Request) -> None:
         """Warn once if prompts of different lengths all count the same tokens: the server cuts them."""
         if reply.usage is None:
             return
-        num_characters = 0
-        for content in (message["content"] for message in request.messages):
-            texts = [content] if isinstance(content, str) else [part.get("text", "") for part in content]
-            num_characters += sum(map(len, texts))
-        seen = self._prompts.setdefault(len(request.digests), deque(maxlen=NUM_EQUAL_PROMPTS))
-        seen.append((reply.usage.prompt_tokens, num_characters))
-        tokens, lengths = {counted for counted, _ in seen}, [length for _, length in seen]
-        if len(seen) == NUM_EQUAL_PROMPTS and len(tokens) == 1 and max(lengths) - min(lengths) >= LEAST_SPREAD:
+        texts: list[str] = []
+        for message in request.messages:
+            content = message["content"]
+            texts += [content] if isinstance(content, str) else [part.get("text", "") for part in content]
+        sizes = self._prompt_sizes.setdefault(len(request.digests), deque(maxlen=NUM_EQUAL_PROMPTS))
+        sizes.append((reply.usage.prompt_tokens, sum(map(len, texts))))
+        token_counts, lengths = zip(*sizes, strict=True)
+        are_equal = len(sizes) == NUM_EQUAL_PROMPTS and len(set(token_counts)) == 1
+        if are_equal and max(lengths) - min(lengths) >= LEAST_SPREAD:
             count = reply.usage.prompt_tokens
-            problem = f"{len(seen)} prompts of different lengths all count {count} tokens: the server drops the rest"
-            self._tell_once("cuts", logging.WARNING, f"{problem}; {self.fix_of(MEANINGS['too_long'])}")
+            problem = f"{len(sizes)} prompts of different lengths all count {count} tokens: the server drops the rest"
+            self._log_once("cuts", logging.WARNING, f"{problem}; {self.fix_of(MEANINGS['too_long'])}")
+
+    # --- the model ---
 
     async def start(self) -> None:
         """Read the server's list of models and choose the one of the settings; TeacherError if that fails."""
-        wanted = self.cfg.model
+        response, refusal = await self._list_models()
+        if response.status in (401, 403):
+            meaning = refusal.meaning if refusal.meaning.ends_run else protocol.KEY
+            raise self._error(meaning.what, got=str(refusal), fix=self.fix_of(meaning))
+        models = protocol.read_models(response)
+        if models == {}:
+            raise self._error("the endpoint lists no model with a usable name", fix="pass --model")
+        if self.cfg.model:
+            if models is not None and self.cfg.model not in models:
+                raise self._no_choice("the endpoint does not have this model", self.cfg.model, models)
+            self.model = self.cfg.model  # of a host without a list, the first request shows whether it exists
+        elif models is None:
+            what = "the server does not return a list of models, so it may not be an OpenAI-compatible endpoint"
+            raise self._error(what, got=str(refusal), fix="correct the URL, or pass --model")
+        elif len(models) > 1:
+            raise self._no_choice("the endpoint has several models", f"{len(models)} models", models)
+        else:
+            [self.model] = models
+        if models is not None:
+            self.context = models[self.model]
+
+    def _no_choice(self, what: str, got: str, models: Iterable[str]) -> TeacherError:
+        return self._error(what, got=got, expected=f"one of {', '.join(list(models)[:8])}", fix="pass --model")
+
+    async def _list_models(self) -> tuple[Response, Refusal]:
+        """Return the response with the models, once the server has loaded one, and the refusal that it may be."""
         deadline_s = time.monotonic() + TOTAL_TIMEOUT_S
         while True:
             try:
@@ -333,30 +370,18 @@ class ChatClient:
             refusal = protocol.read_refusal(response)
             refusal.message = self._clean(refusal.message)
             if response.status == 200 or not refusal.is_loading or time.monotonic() > deadline_s:
-                break
+                return response, refusal
             self._warn(str(refusal), "waiting for the server")
             await asyncio.sleep(LOADING_PAUSE_S)
-        if response.status in (401, 403):
-            meaning = refusal.meaning if refusal.meaning.ends_run else protocol.KEY
-            raise self._error(meaning.what, got=str(refusal), fix=self.fix_of(meaning))
-        models = protocol.read_models(response)
-        if models is None and not wanted:
-            what = "the server does not return a list of models, so it may not be an OpenAI-compatible endpoint"
-            raise self._error(what, got=str(refusal), fix="correct the URL, or pass --model")
-        if models == {}:
-            raise self._error("the endpoint lists no model with a usable name", fix="pass --model")
-        if models is not None and wanted not in models and (wanted or len(models) > 1):
-            what = "the endpoint does not have this model" if wanted else "the endpoint has several models"
-            got, names = wanted or f"{len(models)} models", ", ".join(list(models)[:8])
-            raise self._error(what, got=got, expected=f"one of {names}", fix="pass --model")
-        self.model = wanted or next(iter(models or ()))  # of a host without a list, the first request shows it
-        self.context = (models or {}).get(self.model)
+
+    # --- messages ---
 
     def fix_of(self, meaning: Meaning) -> str:
         """Return the fix of a refusal, with the names of the settings of this client."""
         return self._named(meaning.fix)
 
     def _named(self, text: str) -> str:
+        """Return a message with the names of the settings of this client."""
         for name, own_name in self.cfg.own_names.items():
             text = text.replace(name, own_name)
         return text
@@ -367,10 +392,9 @@ class ChatClient:
     def message_of(self, error: Exception) -> str:
         """Return the message of an exchange that failed."""
         if isinstance(error, TimeoutError | httpx.TimeoutException):
-            fix = self._named(
-                f"raise the limit, such as caption.endpoint.timeout_s={2 * self.cfg.timeout_s:g}, or use a"
-            )
-            return f"no answer within {self.cfg.timeout_s:g} s; {fix} faster server, a smaller model or shorter prompts"
+            limit = self._named(f"caption.endpoint.timeout_s={2 * self.cfg.timeout_s:g}")
+            fix = f"raise the limit, such as {limit}, or use a faster server, a smaller model or shorter prompts"
+            return f"no answer within {self.cfg.timeout_s:g} s; {fix}"
         return self._clean(f"{type(error).__name__} {error}")
 
     def _clean(self, text: str) -> str:

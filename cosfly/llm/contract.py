@@ -16,58 +16,43 @@ from cosfly.formats.captions import Usage
 
 Result = TypeVar("Result")
 CountName = Literal["prompt_tokens", "completion_tokens"]
-AT_ONCE = {
-    False: b"error: interrupted at once\n",
-    True: b"error: interrupted at once; recorded answers are kept; run the same command again to continue\n",
-}
+AT_ONCE = b"error: interrupted at once\n"
+AT_ONCE_WITH_WORK = b"error: interrupted at once; recorded answers are kept; run the same command again to continue\n"
 MOST_TOKENS = 10_000_000  # of one answer: longer than the context of any model
 STOP_AFTER_FAILURES = 20  # consecutive windows or samples without an answer after which a run ends
 
 
 @dataclass(frozen=True)
 class Request:
-    """One conversation and its sampling.
+    """One conversation and its sampling."""
 
-    messages: chat messages, pictures as data URLs. digests: sha256 of the pictures' bytes, in order. schema: JSON
-    schema of the answer. sampling: temperature, max_tokens, seed and further fields of the request.
-    """
-
-    messages: list[dict]
-    digests: list[str]
-    schema: dict
-    sampling: dict[str, Any]
+    messages: list[dict]  # chat messages, pictures as data URLs
+    digests: list[str]  # sha256 of the pictures' bytes, in order
+    schema: dict  # JSON schema of the answer
+    sampling: dict[str, Any]  # temperature, max_tokens, seed and further fields of the request
 
 
 @dataclass(frozen=True)
 class Reply:
-    """One answer.
-
-    structured: how its form was enforced, json_schema, plain, or native (written by rules). usage: None if not
-    reported. finish_reason: the server's, or CONTEXT_FULL. num_thoughts: characters of thoughts that the server sends
-    in a field of their own. is_kept: read from the journal.
-    """
+    """One answer."""
 
     text: str
-    usage: Usage | None
-    structured: str
-    finish_reason: str | None = None
-    num_thoughts: int = field(default=0, compare=False)
-    is_kept: bool = field(default=False, compare=False)
+    usage: Usage | None  # None if not reported
+    structured: str  # how its form was enforced: json_schema, plain, or native (written by rules)
+    finish_reason: str | None = None  # the server's, or CONTEXT_FULL
+    num_thoughts: int = field(default=0, compare=False)  # characters of thoughts in a field of their own
+    is_kept: bool = field(default=False, compare=False)  # read from the journal
 
 
 @dataclass(eq=False)
 class NoAnswer(Exception):
-    """A request without an answer.
+    """A request without an answer."""
 
-    cause: as tallies count it. detail: the server's message. is_final: the request was refused, so repeating it does
-    not help. fix: what helps. wait_s: how long the server asks to wait, if it does.
-    """
-
-    cause: str
-    detail: str
-    is_final: bool = False
+    cause: str  # as tallies count it
+    detail: str  # the server's message
+    is_final: bool = False  # the request was refused, so repeating it does not help
     fix: str = ""
-    wait_s: float | None = None
+    wait_s: float | None = None  # how long the server asks to wait
 
     def __str__(self) -> str:
         return f"{self.cause}: {self.detail}"
@@ -122,7 +107,7 @@ def run_until_interrupted(main: Coroutine[Any, Any, Result], *, keeps_work: bool
         def interrupt(number: signal.Signals) -> None:
             nonlocal received
             if received is not None:
-                os.write(2, AT_ONCE[keeps_work])
+                os.write(2, AT_ONCE_WITH_WORK if keeps_work else AT_ONCE)
                 os._exit(128 + number)
             received = number
             task.cancel()

@@ -95,12 +95,12 @@ def without_system(messages: list[dict]) -> list[dict]:
 
 
 class Meaning(NamedTuple):
-    """A cause of refusals, matched by a pattern. what, fix: of the error. ends_run: all requests are refused."""
+    """A cause of refusals."""
 
-    what: str
-    fix: str
-    ends_run: bool
-    pattern: str = NEVER
+    what: str  # of the error
+    fix: str  # of the error
+    ends_run: bool  # all requests are refused
+    pattern: str = NEVER  # of the server's text
 
 
 MEANINGS: dict[Kind, Meaning] = {
@@ -124,27 +124,25 @@ def kind_of(status: int, text: str) -> Kind:
     flags = re.IGNORECASE | re.DOTALL
     matching = (kind for kind, meaning in MEANINGS.items() if re.search(meaning.pattern, start, flags))
     kind: Kind = "account" if status == 402 else next(matching, "unknown")
-    # In the text of a failed server these words are not about a window or a schema.
-    is_other = status >= 500 and kind in ("content", "schema")
-    return "unknown" if is_other or (status in AWAY and kind != "account") else kind
+    if status in AWAY and kind != "account":
+        return "unknown"
+    if status >= 500 and kind in ("content", "schema"):  # such words of a failed server are about something else
+        return "unknown"
+    return kind
 
 
 @dataclass(eq=False)
 class Refusal(Exception):
-    """A request that a server refused.
-
-    message: the server's text, short, in one line, without the key. wait_s: how long the server asks to wait, if it
-    does. code: the cause, as tallies count it. may_pass: whether the same request may be answered later, because the
-    server is busy, away or broken.
-    """
+    """A request that a server refused."""
 
     status: int
     kind: Kind
-    message: str
-    wait_s: float | None = None
+    message: str  # the server's text; the client makes it one short line without the key
+    wait_s: float | None = None  # how long the server asks to wait
 
     @property
     def code(self) -> str:
+        """The cause, as tallies count it."""
         return f"refused_{self.status if self.kind == 'unknown' else self.kind}"
 
     def __str__(self) -> str:
@@ -152,6 +150,7 @@ class Refusal(Exception):
 
     @property
     def meaning(self) -> Meaning:
+        """The cause by the text, unless the status says more."""
         by_text = MEANINGS[self.kind]
         return by_text if by_text.ends_run or self.kind == "content" else STATUSES.get(self.status, by_text)
 
@@ -162,6 +161,7 @@ class Refusal(Exception):
 
     @property
     def may_pass(self) -> bool:
+        """Whether the same request may be answered later, because the server is busy, away or broken."""
         return self.kind == "unknown" and (self.status in AWAY or self.status >= 500)
 
 
@@ -170,12 +170,12 @@ class Refusal(Exception):
 
 @dataclass(frozen=True)
 class Response:
-    """A response of a server. is_cut: The body exceeds the size limit. retry_after_s: None unless given in seconds."""
+    """A response of a server."""
 
     status: int
     body: bytes
-    is_cut: bool = False
-    retry_after_s: float | None = None
+    is_cut: bool = False  # the body exceeds the size limit
+    retry_after_s: float | None = None  # None unless given in seconds
 
 
 class BadReply(Exception):
@@ -199,10 +199,11 @@ def read_body(content: bytes) -> Any:
 def _joined_events(content: bytes, reject: Callable[[str], float]) -> dict[str, Any]:
     """Return the completion whose pieces an event stream holds: some servers stream whatever the request says."""
     texts: dict[str, str] = {}
-    finish_reason = usage = None
+    finish_reason: str | None = None
+    usage: Any = None
     for line in content.split(b"\n"):  # not splitlines: a JSON string may contain other line separators
-        field, _, data = line.partition(b":")
-        if field != b"data" or not data.strip():
+        name, _, data = line.partition(b":")
+        if name != b"data" or not data.strip():
             continue
         if data.strip() == b"[DONE]":
             finish_reason = finish_reason or "stop"
@@ -215,9 +216,10 @@ def _joined_events(content: bytes, reject: Callable[[str], float]) -> dict[str, 
         choice = choices[0] if choices and isinstance(choices[0], dict) else {}
         finish_reason = choice.get("finish_reason") or finish_reason
         delta = choice.get("delta")
-        for name, piece in delta.items() if isinstance(delta, dict) else ():
-            if isinstance(piece, str):
-                texts[name] = texts.get(name, "") + piece
+        if isinstance(delta, dict):
+            for field, piece in delta.items():
+                if isinstance(piece, str):
+                    texts[field] = texts.get(field, "") + piece
     if finish_reason is None:
         raise ValueError("the event stream ends before the answer is complete")
     return {"choices": [{"message": texts, "finish_reason": finish_reason}], "usage": usage}
@@ -282,20 +284,14 @@ def read_completion(response: Response, structured: str) -> Reply:
         raise read_refusal(response)
     if response.is_cut:
         raise BadReply(f"the response is longer than {len(response.body) / 1e6:g} MB")
-    value, wait_s = _object(response), response.retry_after_s
+    value = _object(response)
     if value is None:
         raise BadReply("the response is not JSON")
-    choices = value.get("choices")
-    if not isinstance(choices, list) or not choices or not isinstance(choices[0], dict):
-        if any(value.get(name) for name in ("error", *MESSAGE_FIELDS)):
-            raise _error_instead(value, wait_s)
-        raise BadReply("the response has no choices")
-    choice = choices[0]
+    choice = _first_choice(value, response.retry_after_s)
     finish_reason = choice.get("finish_reason")
-    if choice.get("error") or finish_reason in ENDED:
-        raise _error_instead(choice if choice.get("error") else {"error": finish_reason}, wait_s)
     message = choice["message"] if isinstance(choice.get("message"), dict) else {}
-    text, usage = _final_text(message), _usage(value.get("usage"))
+    text = _final_text(message)
+    usage = _usage(value.get("usage"))
     refusal = message.get("refusal")
     if not text and isinstance(refusal, str) and refusal:
         return Reply(refusal, usage, structured, DECLINED)
@@ -305,6 +301,21 @@ def read_completion(response: Response, structured: str) -> Reply:
         raise BadReply("the message has no text")
     thoughts = [len(message[name]) for name in THOUGHT_FIELDS if isinstance(message.get(name), str)]
     return Reply(text, usage, structured, _name(finish_reason), num_thoughts=max(thoughts, default=0))
+
+
+def _first_choice(value: dict[str, Any], wait_s: float | None) -> dict[str, Any]:
+    """Return the first choice of a completion; raise the error that a server sent instead of one or in it."""
+    choices = value.get("choices")
+    if not isinstance(choices, list) or not choices or not isinstance(choices[0], dict):
+        if any(value.get(name) for name in ("error", *MESSAGE_FIELDS)):
+            raise _error_instead(value, wait_s)
+        raise BadReply("the response has no choices")
+    choice = choices[0]
+    if choice.get("error"):
+        raise _error_instead(choice, wait_s)
+    if choice.get("finish_reason") in ENDED:
+        raise _error_instead({"error": choice["finish_reason"]}, wait_s)
+    return choice
 
 
 def _name(value: Any) -> str | None:

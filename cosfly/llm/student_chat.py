@@ -8,14 +8,14 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from PIL import Image
-from pydantic import BaseModel, ConfigDict, Field, PositiveInt
+from pydantic import Field, PositiveInt
 
 from cosfly.formats.captions import Language, Place, Prompt
 from cosfly.llm.client import EndpointConfig
 from cosfly.llm.contract import Request
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_bytes
-from cosfly.runtime.json_io import FileFormat, read_model, write_model
+from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 from cosfly.viz.frame_views import View, encode_picture, frame_label
 
 JPEG_QUALITY = 90
@@ -50,9 +50,9 @@ def chat_messages(prompt: Prompt, frames: Sequence[Sequence[dict[str, Any]]]) ->
     frames: Picture parts of each frame, oldest first; a frame without pictures gets no label.
     """
     content: list[dict[str, Any]] = []
-    for number, pictures in enumerate(frames):
+    for index, pictures in enumerate(frames):
         if pictures:
-            content += [{"type": "text", "text": frame_label(number)}, *pictures]
+            content += [{"type": "text", "text": frame_label(index)}, *pictures]
     content.append({"type": "text", "text": prompt.user})
     return [{"role": "system", "content": prompt.system}, {"role": "user", "content": content}]
 
@@ -70,9 +70,10 @@ def limited_size(size_px: tuple[int, int], max_pixels: int) -> tuple[int, int]:
     The student's own processor gets this picture in training, inference and a server, so all make the same tokens.
     """
     scale = math.sqrt(max_pixels / math.prod(size_px))
-    if not max_pixels or scale >= 1.0:
+    if max_pixels == 0 or scale >= 1.0:
         return size_px
-    return max(1, int(size_px[0] * scale)), max(1, int(size_px[1] * scale))
+    width_px, height_px = (max(1, int(side_px * scale)) for side_px in size_px)
+    return width_px, height_px
 
 
 def limited_picture(rgb: np.ndarray, max_pixels: int) -> np.ndarray:
@@ -111,30 +112,22 @@ CHAT_FORMAT_FILE = "cosfly_student.json"
 CHAT_FORMAT = FileFormat("cosfly.student", "1.0", "student")
 
 
-class FrameFormat(BaseModel):
-    """The pictures of a frame: their views in order, width and height, and the largest depth in depth pictures."""
+class FrameFormat(Record):
+    """The pictures of a frame."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    views: tuple[View, ...]
-    size_px: tuple[PositiveInt, PositiveInt]
-    depth_range_m: float = Field(gt=0, allow_inf_nan=False)
+    views: tuple[View, ...]  # in order
+    size_px: tuple[PositiveInt, PositiveInt]  # width and height
+    depth_range_m: float = Field(gt=0, allow_inf_nan=False)  # largest depth in depth pictures
 
 
-class ChatFormat(BaseModel):
-    """`cosfly_student.json`, next to a student's weights: the form of its chats in training.
+class ChatFormat(Record):
+    """`cosfly_student.json`, next to a student's weights: the form of its chats in training."""
 
-    prompts: One question per language. num_frames: Frames of a window. looks: Picture formats of all training samples,
-    sorted. max_pixels: Limit of a picture (`limited_size`). decision: Its place among the fields of an answer.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    prompts: dict[Language, Prompt] = Field(min_length=1)
-    num_frames: int = Field(ge=1)
-    looks: list[FrameFormat] = Field(min_length=1)
-    max_pixels: int = Field(ge=1)
-    decision: Place = "last"
+    prompts: dict[Language, Prompt] = Field(min_length=1)  # one question per language
+    num_frames: int = Field(ge=1)  # of a window
+    looks: list[FrameFormat] = Field(min_length=1)  # picture formats of all training samples, sorted
+    max_pixels: int = Field(ge=1)  # of a picture (`limited_size`)
+    decision: Place = "last"  # among the fields of an answer
 
 
 def write_chat_format(folder: Path, chat_format: ChatFormat) -> None:
@@ -160,9 +153,7 @@ def _student_folder(folder: Path) -> Path:
     for candidate in (folder, folder / "adapter", folder / "model"):
         if (candidate / CHAT_FORMAT_FILE).is_file():
             return candidate
-    raise InputError(
-        f"the student's folder has no {CHAT_FORMAT_FILE}, which stores the format of the student's prompts",
-        where=folder,
-        expected="this file in the folder, or in adapter/ or model/ below the folder",
-        fix="pass the output directory of cosfly distill train or merge",
-    )
+    what = f"the student's folder has no {CHAT_FORMAT_FILE}, which stores the format of the student's prompts"
+    expected = "this file in the folder, or in adapter/ or model/ below the folder"
+    fix = "pass the output directory of cosfly distill train or merge"
+    raise InputError(what, where=folder, expected=expected, fix=fix)

@@ -104,7 +104,8 @@ class VllmEngine:
             raise EnvironmentMissing("the vLLM engine does not start", where=self.where, got=_one_line(error)) from None
 
     def _rejected(self, section: str, error: Exception) -> ConfigError:
-        what, fix = f"vLLM rejects a setting in the section {section}", "correct or remove this setting"
+        what = f"vLLM rejects a setting in the section {section}"
+        fix = "correct or remove this setting"
         return ConfigError(what, where=f"{self.settings}.{section}", got=_one_line(error), fix=fix)
 
     def arguments(self) -> dict[str, Any]:
@@ -142,9 +143,10 @@ class VllmEngine:
 
     def _add_new(self, llm: Any) -> None:
         """Add new requests to vLLM; wait for one if there is nothing else to do."""
-        for number in range(min(ADDED_PER_STEP, self.cfg.batch - len(self._open))):
+        for num_added in range(min(ADDED_PER_STEP, self.cfg.batch - len(self._open))):
+            has_work = bool(self._open) or num_added > 0
             try:
-                entry = self._new.get(block=not (self._open or number))
+                entry = self._new.get(block=not has_work)
             except queue.Empty:
                 return
             if entry is None:  # the engine closes

@@ -11,9 +11,9 @@ import io
 import logging
 import math
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
@@ -60,11 +60,6 @@ SIZES = ("length_m", "width_m", "height_m", "min_height")  # numbers in metres, 
 OTHERS = ("z_m", "yaw_deg", "building:levels", "building:min_level", "lanes")
 PLACE = ("x_m", "y_m", "length_m", "width_m")  # every table has them; and height_m, except of surfaces
 TYPES = [kind for kind in KINDS if kind != "NONE"]
-TYPE_RULES = [  # pattern of the column, geometry, pattern of the value, type
-    (column, rule.get("geometry", ""), value, kind)
-    for rule in read_yaml(Path(__file__).with_name("feature_rules.yaml"))["rules"]
-    for column in rule["column"].split("|") for values, kind in rule["kinds"].items() for value in values.split("|")
-]  # fmt: skip
 GEOMETRIES = ("Point", "LineString", "Polygon", "MultiPoint", "MultiLineString", "MultiPolygon")  # of GeoJSON
 LARGEST_PLACE = 1e8  # absolute value of a coordinate of GeoJSON, in any unit
 MOST_NAME = 40  # characters of a name in messages
@@ -79,7 +74,31 @@ DEFAULT_SIZES_M = {
     "Walls": (0.3, 2.0), "Fences": (0.2, 1.5), "GuardRail": (0.3, 0.8), "Static": (1.0, 1.0), "Terrain": (2.0, SLAB_M),
 }  # fmt: skip
 FAR_M = 10_000.0  # a map with its middle farther from the origin is moved there
-OUTLINE_FILL, OUTLINE_PIECE_M = 0.9, 3.0  # share of its boxes that an outline fills; shortest piece that is cut
+OUTLINE_FILL = 0.9  # share of its boxes that an outline fills
+OUTLINE_PIECE_M = 3.0  # pieces of an outline that are no longer are not cut again
+TABLE_SETTINGS = {"types", "ignore", "ground_z_m", "units", "type_column"}  # settings that a boxes_3d.json ignores
+
+
+class TypeRule(NamedTuple):
+    """The kind of features of OpenStreetMap and Overture: a rule of `feature_rules.yaml`."""
+
+    column: str  # pattern
+    value: str  # pattern
+    geometry: str  # part of the name of a geometry, such as Line; empty: any
+    kind: str  # NONE: no boxes
+
+    def covers(self, column: str, value: str, geometry: str) -> bool:
+        """Return whether the rule applies to a feature with this value in the column of its type."""
+        is_form = self.geometry in geometry
+        return is_form and fnmatchcase(column, self.column) and fnmatchcase(value, self.value)
+
+
+# A line of the file stands for several columns and values, separated by `|`.
+TYPE_RULES = [
+    TypeRule(column, value, line.get("geometry", ""), kind)
+    for line in read_yaml(Path(__file__).with_name("feature_rules.yaml"))["rules"]
+    for column in line["column"].split("|") for values, kind in line["kinds"].items() for value in values.split("|")
+]  # fmt: skip
 
 
 class BoxesConfig(Config):
@@ -132,13 +151,13 @@ class BoxesConfig(Config):
 
 
 class _Row(NamedTuple):
-    """One row of a table or a feature; `problem` is empty if it could be read."""
+    """One row of a table or one feature."""
 
-    where: str
-    values: Mapping[str, Any]
+    where: str  # its place in the file, such as `line 3`
+    values: Mapping[str, Any]  # by column
     shape: Any = Point()  # a geometry of shapely
-    problem: str = ""
-    reason: str = "bad_geometry"
+    problem: str = ""  # why it cannot be used
+    reason: str = "bad_geometry"  # of the problem, for the counts
 
 
 class _Skipped(Exception):
@@ -149,6 +168,26 @@ class _Skipped(Exception):
         self.reason = reason
 
 
+@dataclass
+class _Made:
+    """The boxes of all rows."""
+
+    boxes: BoxList = field(default_factory=BoxList)
+    row_of_box: list[int] = field(default_factory=list)  # index of the row of each box
+    size_sources: Counter[str] = field(default_factory=Counter)  # number of boxes by the source of their sizes
+    dropped: SkippedEntries = field(default_factory=SkippedEntries)  # rows without boxes
+    repairs: list[str] = field(default_factory=list)  # places of outlines that were repaired
+
+
+class _Size(NamedTuple):
+    """The size of the boxes of a row."""
+
+    numbers: Mapping[str, float]  # finite values by column; lengths in m
+    low_m: float
+    high_m: float
+    source: str  # file, levels or default
+
+
 def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     """Read boxes; the seed changes nothing."""
     path = cfg.inputs()["boxes"]
@@ -157,126 +196,90 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
         raise InputError(
             "the file type of the map is not supported", where=path, got=path.suffix, expected=".json, .csv or .geojson"
         )
-    of_tables = {"types", "ignore", "ground_z_m", "units", "type_column"}
-    if suffix == ".json" and cfg.model_dump(include=of_tables) != BoxesConfig().model_dump(include=of_tables):
-        raise ConfigError(
-            "boxes_3d.json contains its own types, units and ground height, so settings for them would have no effect",
-            where="maps.boxes",
-            fix=f"remove the settings {', '.join(f'maps.boxes.{name}' for name in sorted(of_tables))}",
-        )
-    box_map = read_boxes(path) if suffix == ".json" else _read_rows(cfg, path, suffix)
-    settings = cfg.model_dump(include=cfg.model_fields_set & {"name", "licence", "credits"})
-    source = MapSource(tool=box_map.header.source.tool or "boxes", file=path.name)
-    header = box_map.header.model_copy(update={**settings, "source": source})
+    if suffix == ".json":
+        if cfg.model_dump(include=TABLE_SETTINGS) != BoxesConfig().model_dump(include=TABLE_SETTINGS):
+            raise ConfigError(
+                "boxes_3d.json contains its own types, units and ground height, so settings for them would have no "
+                "effect",
+                where="maps.boxes",
+                fix=f"remove the settings {', '.join(f'maps.boxes.{name}' for name in sorted(TABLE_SETTINGS))}",
+            )
+        box_map = read_boxes(path)
+    else:
+        box_map = _read_rows(cfg, path, is_table=suffix == ".csv")
+    changes: dict[str, Any] = cfg.model_dump(include=cfg.model_fields_set & {"name", "licence", "credits"})
+    changes["source"] = MapSource(tool=box_map.header.source.tool or "boxes", file=path.name)
     low, high = box_map.bounds()
     origin = origin_m(low, high, path)
     if np.abs(origin).max() > FAR_M:
         log.info("%s: the middle of the map, %s, becomes the origin", path.name, origin[:2].tolist())
-        header = header.model_copy(update={"offset_m": dict(zip("xyz", origin.tolist(), strict=True))})
+        changes["offset_m"] = dict(zip("xyz", origin.tolist(), strict=True))
         box_map = replace(box_map, centers=box_map.centers - origin)
-    box_map = replace(box_map, header=header)
+    box_map = replace(box_map, header=box_map.header.model_copy(update=changes))
     return with_derived_ground(box_map) if cfg.derive_ground else box_map
 
 
-def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
+def _read_rows(cfg: BoxesConfig, path: Path, *, is_table: bool) -> BoxMap:
     """Return the boxes of a table or of features."""
-    rows, units = (_table_rows(cfg, path), cfg.units) if suffix == ".csv" else _feature_rows(cfg, path)
+    units = cfg.units
+    if is_table:
+        rows = _table_rows(cfg, path)
+    else:
+        rows, units = _feature_rows(cfg, path)
     if not rows:
         raise InputError("the file has no boxes", where=path, expected="at least one row or feature with a box")
-    boxes = BoxList()
-    sources = Counter[str]()
-    dropped = SkippedEntries()
-    notes = defaultdict[str, list[str]](list)
-    row_of_box: list[int] = []
-    metric_rows = _in_metres(rows, units, path, is_table=suffix == ".csv")
-    for part in shapely.get_parts([row.shape for row in metric_rows if not row.problem]):
+    rows = _in_metres(rows, units, path, is_table=is_table)
+    made = _make_boxes(rows, cfg)
+    ids = _ids_of(rows) if cfg.is_plain else []
+    _check_and_report(made, rows, ids, cfg, path)
+    header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows))
+    changes: dict[str, Any] = {"dropped_objects": dict(made.dropped.counts)} if made.dropped.counts else {}
+    if set(made.size_sources) != {"file"}:
+        changes["extent_sources"] = dict(made.size_sources)
+    box_map = made.boxes.box_map(header.model_copy(update=changes))
+    if ids and len(set(made.row_of_box)) == len(box_map):  # no row became several boxes
+        box_map = replace(box_map, ids=np.array([ids[index] for index in made.row_of_box], dtype=np.uint64))
+    return box_map
+
+
+def _make_boxes(rows: list[_Row], cfg: BoxesConfig) -> _Made:
+    """Make the boxes of all rows, in metres; a row that cannot be used is counted."""
+    made = _Made()
+    boxes = made.boxes
+    for part in shapely.get_parts([row.shape for row in rows if not row.problem]):
         if isinstance(part, Polygon):
             boxes.reserve(num_cuts(part, OUTLINE_PIECE_M, np.inf, CUT_SHARES), len(part.exterior.coords))
-    for k, row in enumerate(metric_rows):
+    for index, row in enumerate(rows):
         num_before = len(boxes)
         try:
-            source = _add(boxes, row, cfg, notes)
-            if len(boxes) == num_before:
-                raise _Skipped("no_area", "the outline has no area")
-            sources[source] += len(boxes) - num_before
-            row_of_box += [k] * (len(boxes) - num_before)
+            source = _add_row(boxes, row, cfg, made.repairs)
         except _Skipped as error:
             del boxes.rows[num_before:], boxes.kinds[num_before:]
-            dropped.add(error.reason, row.where, str(error), is_bad=error.reason != "unmapped_type")
-    ids = _ids_of(rows) if cfg.is_plain else []
-    if len(set(ids)) < len(ids) or not all(0 <= number < 2**63 for number in ids):
+            made.dropped.add(error.reason, row.where, str(error), is_bad=error.reason != "unmapped_type")
+        else:
+            made.size_sources[source] += len(boxes) - num_before
+            made.row_of_box += [index] * (len(boxes) - num_before)
+    return made
+
+
+def _check_and_report(made: _Made, rows: list[_Row], ids: list[int], cfg: BoxesConfig, path: Path) -> None:
+    """Raise InputError if the ids are invalid or too many rows are; log what a user may want to correct."""
+    dropped = made.dropped
+    if len(set(ids)) < len(ids) or not all(0 <= box_id < 2**63 for box_id in ids):
         dropped.add("bad_id", "id", "the ids must be different whole numbers")
         dropped.num_bad += len(rows)
-    if not len(boxes):
+    if not len(made.boxes):
         dropped.num_bad += len(rows)
     expected = (
         f"at most {cfg.most_skipped:.0%} invalid rows (maps.boxes.most_skipped); columns {', '.join(COLUMNS)}; "
         f"types {', '.join(TYPES)}, or types listed in maps.boxes.types"
     )
     dropped.check(path, len(rows) - dropped.counts["unmapped_type"], cfg.most_skipped, expected)
-    for note, places in notes.items():
-        log.warning("%s: %s", path.name, listed(places, note))
-    if sources["levels"] or sources["default"]:
+    if made.repairs:
+        log.warning("%s: %s", path.name, listed(made.repairs, "the outline crosses itself and is repaired"))
+    if made.size_sources["levels"] or made.size_sources["default"]:
         words = "%s: %d boxes have their size from the file, %d a height from their storeys, %d a default size"
-        log.warning(words, path.name, *(sources[name] for name in ("file", "levels", "default")))
-    header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows))
-    update: dict[str, Any] = {"dropped_objects": dict(dropped.counts)} if dropped.counts else {}
-    if set(sources) != {"file"}:
-        update["extent_sources"] = dict(sources)
-    box_map = boxes.box_map(header.model_copy(update=update))
-    if ids and len(set(row_of_box)) == len(box_map):  # no row became several boxes
-        box_map = replace(box_map, ids=np.array([ids[k] for k in row_of_box], dtype=np.uint64))
-    return box_map
-
-
-def _in_metres(rows: list[_Row], units: Units, path: Path, *, is_table: bool) -> list[_Row]:
-    """Return rows with their places in metres, with a problem if they are far from the middle of the others."""
-    shapes = np.array([row.shape for row in rows])
-    places = shapely.get_coordinates(shapes)
-    if not len(places):
-        return rows
-    units = _units_of(rows, places, units, path, is_table=is_table)
-    project = to_metres(units, places)
-    middle = np.median(project(places), axis=0)
-    moved = [row._replace(shape=shape) for row, shape in zip(rows, shapely.transform(shapes, project), strict=True)]
-    for k, row in enumerate(moved):
-        z = _number(row.values.get("z_m"))
-        if is_table and not math.isnan(z):
-            moved[k] = row = row._replace(values={**row.values, "z_m": z * METRES.get(units, 1.0)})
-        farthest_m = float(np.abs(shapely.get_coordinates(row.shape) - middle).max(initial=0.0))
-        if farthest_m > WIDEST_M:
-            place = ", ".join(f"{value:.6g}" for value in shapely.get_coordinates(rows[k].shape)[0])
-            problem = f"it is {farthest_m / 1000:,.0f} km from the middle of the map, at {place}"
-            moved[k] = row._replace(problem=problem, reason="far_away")
-    return moved
-
-
-def _units_of(rows: list[_Row], places: np.ndarray, units: Units, path: Path, *, is_table: bool) -> Units:
-    """Return the unit of the coordinates: the one that is set or declared, or what they look like."""
-    shapes = [row.shape for row in rows if not row.problem]
-    corners = shapely.bounds(shapes)
-    sizes = np.maximum(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    if not sizes.any():  # points only
-        places = shapely.get_coordinates(shapes)
-        points = shapely.points(places)
-        near = {"exclusive": True, "all_matches": False, "return_distance": True}
-        _, sizes = shapely.STRtree(points).query_nearest(points, **near)
-    seen = seen_units(places, sizes)
-    if units == "auto" and seen is None:
-        what, fix = "the coordinates fit both metres and degrees", "set maps.boxes.units to `m` or to `degrees`"
-        raise InputError(what, where=path, got=f"a median size of {np.median(sizes):.3g} units", fix=fix)
-    if units == "auto" and seen is not None and not (is_table and seen == "degrees"):
-        return seen
-    if seen is not None and len(places) > 1 and (seen == "degrees") != (units == "degrees"):
-        name = "degrees" if units == "degrees" else "metres"
-        raise InputError(
-            f"the coordinates are too {'large' if units == 'degrees' else 'small'} to be {name}",
-            where=path,
-            got=f"{places.min(axis=0).tolist()} to {places.max(axis=0).tolist()}",
-            expected=f"coordinates in {name}, the unit that maps.boxes.units or the file states",
-            fix=f"if the coordinates are in {seen}, pass --set maps.boxes.units={seen}",
-        )
-    return units
+        log.warning(words, path.name, *(made.size_sources[name] for name in ("file", "levels", "default")))
 
 
 def _ids_of(rows: Sequence[_Row]) -> list[int]:
@@ -287,55 +290,66 @@ def _ids_of(rows: Sequence[_Row]) -> list[int]:
     return [int(text) if text.isascii() and text.isdecimal() else -1 for text in texts]
 
 
+# --- rows of a file ---------------------------------------------------------------------------------------------------
+
+
 def _table_rows(cfg: BoxesConfig, path: Path) -> list[_Row]:
+    """Read the rows of a CSV table."""
     reader = csv.reader(io.StringIO(read_text(path, what="table of boxes").removeprefix("\ufeff")), strict=True)
     try:
         lines = [(f"line {reader.line_num}", [cell.strip() for cell in line]) for line in reader]
     except csv.Error as error:
-        where, fix = f"{path}: line {reader.line_num}", "export the table again as CSV"
+        where = f"{path}: line {reader.line_num}"
+        fix = "export the table again as CSV"
         raise InputError("the file is not a CSV table", where=where, got=str(error), fix=fix) from None
     lines = [(where, cells) for where, cells in lines if any(cells)]
     if not lines:
         return []
     names = [OTHER_NAMES.get(cell, cell) for cell in lines[0][1]]
     problems = [] if set(cfg.type_columns) & set(names) else [f"the column {cfg.type_column} is missing"]
-    problems += _unknown(names, cfg)
+    problems += _unknown_columns(names, cfg)
     problems += [f"the column {name} is missing" for name in PLACE if name not in names]
     problems += [f"the column {name} occurs twice" for name, count in Counter(names).items() if count > 1]
     if problems:
         raise InputError.of_all(problems, where=path, expected=f"columns {', '.join(COLUMNS)}, separated by commas")
-    rows: list[_Row] = []
-    for where, cells in lines[1:]:
-        problem = "" if len(cells) == len(names) else f"{len(cells)} cells, but the first line has {len(names)}"
-        values = {name: cell for name, cell in zip(names, cells, strict=False) if cell}
-        x, y = (_number(values.get(name)) for name in PLACE[:2])
-        for name, number in zip(PLACE, (x, y), strict=False):
-            if not problem and math.isnan(number):
-                problem = (
-                    f"{name} is not a finite number: {values[name][:40]!r}" if name in values else f"{name} is missing"
-                )
-        rows.append(_Row(where, values, Point() if problem else Point(x, y), problem, "bad_value"))
-    return rows
+    return [_table_row(where, names, cells) for where, cells in lines[1:]]
+
+
+def _table_row(where: str, names: Sequence[str], cells: Sequence[str]) -> _Row:
+    values = {name: cell for name, cell in zip(names, cells, strict=False) if cell}
+    position = {name: _number(values.get(name)) for name in ("x_m", "y_m")}
+    problem = "" if len(cells) == len(names) else f"{len(cells)} cells, but the first line has {len(names)}"
+    for name, number in position.items():
+        if not problem and math.isnan(number):
+            problem = (
+                f"{name} is not a finite number: {values[name][:40]!r}" if name in values else f"{name} is missing"
+            )
+    return _Row(where, values, Point() if problem else Point(*position.values()), problem, "bad_value")
 
 
 def _feature_rows(cfg: BoxesConfig, path: Path) -> tuple[list[_Row], Units]:
-    """Return the features, and the unit that is set or that the file declares."""
+    """Read the features of a GeoJSON file, and the unit that is set or that the file declares."""
     value = read_json(path, what="map")
     if not isinstance(value, dict) or value.get("type") not in ("FeatureCollection", "Feature", *GEOMETRIES):
-        expected, fix = f"FeatureCollection, Feature, {', '.join(GEOMETRIES)}", "export the file again as GeoJSON"
+        expected = f"FeatureCollection, Feature, {', '.join(GEOMETRIES)}"
+        fix = "export the file again as GeoJSON"
         raise InputError("the file is not GeoJSON", where=f"{path}: type", expected=f"one of {expected}", fix=fix)
     items = value.get("features") if value["type"] == "FeatureCollection" else [value]
     if not isinstance(items, list):
-        what, fix = "the FeatureCollection has no list of features", "export the file again as GeoJSON"
+        what = "the FeatureCollection has no list of features"
+        fix = "export the file again as GeoJSON"
         raise InputError(what, where=f"{path}: features", expected="a list of Feature objects", fix=fix)
-    systems = [value.get("crs"), *(item.get("crs") for item in items if isinstance(item, dict))]
-    declared = list({str(system): system for system in systems if system is not None}.values())
-    units = (declared_units(declared, f"{path}: crs") or "auto") if cfg.units == "auto" else cfg.units
+    units = cfg.units
+    if units == "auto":
+        systems = [value.get("crs"), *(item.get("crs") for item in items if isinstance(item, dict))]
+        declared = list({str(system): system for system in systems if system is not None}.values())
+        units = declared_units(declared, f"{path}: crs") or "auto"
     features = [_feature(item, number) for number, item in enumerate(items, 1)]
-    if problems := _unknown(list(dict.fromkeys(name for feature in features for name in feature.values)), cfg):
+    if problems := _unknown_columns(list(dict.fromkeys(name for row in features for name in row.values)), cfg):
         raise InputError.of_all(problems, where=path, expected=f"columns {', '.join(COLUMNS)}")
     heights = shapely.get_coordinates([feature.shape for feature in features], include_z=True)[:, 2]
-    if len(heights := heights[np.isfinite(heights) & (heights != 0)]):
+    heights = heights[np.isfinite(heights) & (heights != 0)]
+    if len(heights):
         log.warning(
             "%s: z of coordinates, %.4g to %.4g, is ignored; all is on the ground, at %g m (z_m of a feature counts)",
             path.name, heights.min(), heights.max(), cfg.ground_z_m,
@@ -347,14 +361,16 @@ def _feature(item: Any, number: int) -> _Row:
     """Return a Feature or a bare geometry with its properties; `number` counts from 1."""
     item = item if isinstance(item, dict) else {}
     properties = item["properties"] if isinstance(item.get("properties"), dict) else {}
-    if isinstance(tags := properties.get("other_tags"), str):  # where ogr2ogr writes the rest of OpenStreetMap's tags
+    tags = properties.get("other_tags")
+    if isinstance(tags, str):  # where ogr2ogr writes the rest of OpenStreetMap's tags: "building"=>"yes","height"=>"9"
         properties = dict(HSTORE_TAG.findall(tags)) | {name: v for name, v in properties.items() if v is not None}
     values = {OTHER_NAMES[name]: value for name, value in properties.items() if name in OTHER_NAMES}
     values |= {name: value for name, value in properties.items() if name not in OTHER_NAMES}
     where = f"feature {number}"
-    names = (properties.get("name"), item.get("id"), properties.get("id"))
-    if name := next((str(value)[:MOST_NAME] for value in names if value not in (None, "")), None):
-        where += f" ({name})"
+    for name in (properties.get("name"), item.get("id"), properties.get("id")):
+        if name not in (None, ""):
+            where += f" ({str(name)[:MOST_NAME]})"
+            break
     geometry = item.get("geometry") if item.get("type") == "Feature" else item
     kind = geometry.get("type") if isinstance(geometry, dict) else None
     if kind not in GEOMETRIES:
@@ -364,14 +380,15 @@ def _feature(item: Any, number: int) -> _Row:
         outline = shape(geometry)
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError, shapely.errors.ShapelyError):
         outline = Polygon()
-    places = shapely.get_coordinates(outline)
-    if len(places) == 0 or not (np.abs(places) <= LARGEST_PLACE).all():  # NaN fails
+    corners = shapely.get_coordinates(outline)
+    if len(corners) == 0 or not (np.abs(corners) <= LARGEST_PLACE).all():  # NaN fails
         problem = f"the coordinates of the {kind} are invalid; expected [x, y], at least four points in a ring"
         return _Row(where, values, problem=problem)
     return _Row(where, values, outline)
 
 
-def _unknown(names: Sequence[str], cfg: BoxesConfig) -> list[str]:
+def _unknown_columns(names: Sequence[str], cfg: BoxesConfig) -> list[str]:
+    """Return a message for each column or property that has no meaning here."""
     if "*" in cfg.ignore or not cfg.is_plain:
         return []
     if tags := [tag for tag in ("building", "highway", "natural", "class") if tag in names]:
@@ -381,57 +398,151 @@ def _unknown(names: Sequence[str], cfg: BoxesConfig) -> list[str]:
     return [f"unknown column {name!r}{nearest(name, COLUMNS)}" for name in names if name not in accepted]
 
 
+def _number(value: Any) -> float:
+    """Return a value as a number; NaN if it is none, or larger than any length."""
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError):
+        return math.nan
+    return number if abs(number) <= LARGEST else math.nan
+
+
+# --- coordinates ------------------------------------------------------------------------------------------------------
+
+
+def _in_metres(rows: list[_Row], units: Units, path: Path, *, is_table: bool) -> list[_Row]:
+    """Return rows with their coordinates in metres, with a problem if they are far from the middle of the others."""
+    shapes = np.array([row.shape for row in rows])
+    coordinates = shapely.get_coordinates(shapes)
+    if not len(coordinates):
+        return rows
+    units = _units_of(rows, coordinates, units, path, is_table=is_table)
+    project = to_metres(units, coordinates)
+    middle = np.median(project(coordinates), axis=0)
+    metric_rows: list[_Row] = []
+    for row, metric_shape in zip(rows, shapely.transform(shapes, project), strict=True):
+        metric_row = row._replace(shape=metric_shape)
+        z = _number(row.values.get("z_m"))
+        if is_table and not math.isnan(z):
+            metric_row = metric_row._replace(values={**row.values, "z_m": z * METRES.get(units, 1.0)})
+        farthest_m = float(np.abs(shapely.get_coordinates(metric_shape) - middle).max(initial=0.0))
+        if farthest_m > WIDEST_M:
+            place = ", ".join(f"{value:.6g}" for value in shapely.get_coordinates(row.shape)[0])
+            problem = f"it is {farthest_m / 1000:,.0f} km from the middle of the map, at {place}"
+            metric_row = metric_row._replace(problem=problem, reason="far_away")
+        metric_rows.append(metric_row)
+    return metric_rows
+
+
+def _units_of(rows: list[_Row], coordinates: np.ndarray, units: Units, path: Path, *, is_table: bool) -> Units:
+    """Return the unit of the coordinates: the one that is set or declared, or what they look like.
+
+    In a table degrees are never assumed; they must be set.
+    """
+    shapes = [row.shape for row in rows if not row.problem]
+    bounds = shapely.bounds(shapes)
+    sizes = np.maximum(bounds[:, 2] - bounds[:, 0], bounds[:, 3] - bounds[:, 1])
+    if not sizes.any():  # points only
+        coordinates = shapely.get_coordinates(shapes)
+        points = shapely.points(coordinates)
+        tree = shapely.STRtree(points)
+        _, sizes = tree.query_nearest(points, exclusive=True, all_matches=False, return_distance=True)
+    seen = seen_units(coordinates, sizes)
+    if units == "auto" and seen is None:
+        what = "the coordinates fit both metres and degrees"
+        fix = "set maps.boxes.units to `m` or to `degrees`"
+        raise InputError(what, where=path, got=f"a median size of {np.median(sizes):.3g} units", fix=fix)
+    if units == "auto" and seen is not None and not (is_table and seen == "degrees"):
+        return seen
+    if seen is not None and len(coordinates) > 1 and (seen == "degrees") != (units == "degrees"):
+        name = "degrees" if units == "degrees" else "metres"
+        what = f"the coordinates are too {'large' if units == 'degrees' else 'small'} to be {name}"
+        got = f"{coordinates.min(axis=0).tolist()} to {coordinates.max(axis=0).tolist()}"
+        expected = f"coordinates in {name}, the unit that maps.boxes.units or the file states"
+        fix = f"if the coordinates are in {seen}, pass --set maps.boxes.units={seen}"
+        raise InputError(what, where=path, got=got, expected=expected, fix=fix)
+    return units
+
+
+# --- boxes of a row ---------------------------------------------------------------------------------------------------
+
+
+def _add_row(boxes: BoxList, row: _Row, cfg: BoxesConfig, repairs: list[str]) -> str:
+    """Add the boxes of a row; return the source of their sizes.
+
+    The place of a row whose outline is repaired is added to `repairs`. _Skipped is raised if a row cannot be used.
+    """
+    if row.problem:
+        raise _Skipped(row.reason, row.problem)
+    kind = _kind_of(row, cfg)
+    size = _size_of(row, kind, cfg)
+    num_before = len(boxes)
+    try:
+        for part in shapely.get_parts(row.shape):
+            for center, sides_m, yaw_deg in _rectangles(part, size.numbers, row.where, repairs):
+                boxes.add(kind, center, sides_m, size.low_m, size.high_m, yaw_deg)
+    except ValueError as error:  # so far from the origin that its size is lost
+        raise _Skipped("bad_value", str(error)) from None
+    if len(boxes) == num_before:
+        raise _Skipped("no_area", "the outline has no area")
+    return size.source
+
+
 def _kind_of(row: _Row, cfg: BoxesConfig) -> str:
     """Return the kind of a row; raise _Skipped if its type is unknown."""
-    values = {column: str(row.values.get(column) or "") for column in cfg.type_columns}
-    column, name = next(((column, name) for column, name in values.items() if name), (cfg.type_columns[0], ""))
+    column, name = cfg.type_columns[0], ""
+    for type_column in cfg.type_columns:  # the first with a value
+        if row.values.get(type_column):
+            column, name = type_column, str(row.values[type_column])
+            break
     kind = cfg.types.get(name, name)
     if kind in TYPES:
         return kind
     if cfg.is_plain:
         raise _Skipped("unknown_type", f"unknown type {name[:40]!r}{nearest(name, [*TYPES, *cfg.types])}")
-    for of_column, geometry, pattern, kind in TYPE_RULES:
-        if fnmatchcase(column, of_column) and geometry in row.shape.geom_type and fnmatchcase(name, pattern):
-            if kind in TYPES:
-                return kind
-            break
+    for rule in TYPE_RULES:
+        if rule.covers(column, name, row.shape.geom_type):
+            if rule.kind in TYPES:
+                return rule.kind
+            break  # such features have no boxes
     if not name:
-        own = ", ".join(row.values)[:80] or "none"
-        words = f"maps.boxes.type_column names no property of this feature, which has {own}"
+        properties = ", ".join(row.values)[:80] or "none"
+        words = f"maps.boxes.type_column names no property of this feature, which has {properties}"
         raise _Skipped("unmapped_type", words)
     raise _Skipped("unmapped_type", f"there is no type for {column}={name[:40]!r}; maps.boxes.types can name one")
 
 
-def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig, notes: dict[str, list[str]]) -> str:
-    """Add the boxes of a row; return the source of their sizes. _Skipped says why a row cannot be used."""
-    if row.problem:
-        raise _Skipped(row.reason, row.problem)
-    kind = _kind_of(row, cfg)
-    lengths = {name: length_m(value) for name in SIZES if (value := row.values.get(name)) is not None}
-    others = {name: _number(value) for name in OTHERS if (value := row.values.get(name)) is not None}
-    numbers = {name: number for name, number in (lengths | others).items() if not math.isnan(number)}
-    not_finite = [name for name in lengths | others if name not in numbers] if cfg.is_plain else []
+def _size_of(row: _Row, kind: str, cfg: BoxesConfig) -> _Size:
+    """Return the size of a row's boxes: as declared, by its storeys and lanes, or the default of its kind."""
+    values = {name: length_m(row.values[name]) for name in SIZES if row.values.get(name) is not None}
+    values |= {name: _number(row.values[name]) for name in OTHERS if row.values.get(name) is not None}
+    numbers = {name: number for name, number in values.items() if not math.isnan(number)}
+    not_finite = [name for name in values if name not in numbers] if cfg.is_plain else []
+    forms = {part.geom_type for part in shapely.get_parts(row.shape)}
     source = "file"
     if "height_m" not in numbers and "building:levels" in numbers:
         numbers["height_m"] = numbers["building:levels"] * STOREY_M
         source = "levels"
-    above_m = numbers.get("min_height", numbers.get("building:min_level", 0.0) * STOREY_M)
-    parts = list(shapely.get_parts(row.shape))
-    is_line, is_point = (any(isinstance(part, form) for part in parts) for form in (LineString, Point))
-    is_slab = "height_m" not in numbers and KINDS[kind] in GROUND_KINDS
-    needed = ["length_m"] * is_point + ["width_m"] * (is_point or is_line)
-    needed += ["height_m"] * (not is_slab)
-    if is_line and "lanes" in numbers:
+    if "LineString" in forms and "lanes" in numbers:
         numbers.setdefault("width_m", numbers["lanes"] * LANE_M)
+    above_m = numbers.get("min_height", numbers.get("building:min_level", 0.0) * STOREY_M)
+    is_slab = "height_m" not in numbers and KINDS[kind] in GROUND_KINDS
+    is_needed = {
+        "length_m": "Point" in forms,
+        "width_m": bool(forms & {"Point", "LineString"}),
+        "height_m": not is_slab,
+    }
+    needed = [name for name in is_needed if is_needed[name]]
     if not cfg.is_plain and kind in DEFAULT_SIZES_M:
-        width, height = DEFAULT_SIZES_M[kind]
-        defaults = {"length_m": width, "width_m": width, "height_m": above_m + height}
-        source = "default" if any(name in defaults and name not in numbers for name in needed) else source
-        is_slab = is_slab or ("height_m" not in numbers and height == SLAB_M)
+        width_m, height_m = DEFAULT_SIZES_M[kind]
+        defaults = {"length_m": width_m, "width_m": width_m, "height_m": above_m + height_m}
+        if any(name not in numbers for name in needed):
+            source = "default"
+        is_slab = is_slab or ("height_m" not in numbers and height_m == SLAB_M)
         numbers = defaults | numbers
     problems = [f"{name} is missing" for name in needed if name not in numbers and name not in not_finite]
     problems += [f"{name} is not a finite number: {str(row.values[name])[:40]!r}" for name in not_finite]
-    problems += [f"{name} must be above 0" for name in needed if name[0] in "lwh" and numbers.get(name, 1.0) <= 0]
+    problems += [f"{name} must be above 0" for name in needed if numbers.get(name, 1.0) <= 0]
     if above_m and numbers.get("height_m", math.inf) <= above_m:
         problems.append(f"height_m must be above the minimum height, {above_m:g} m")
     if problems:
@@ -440,45 +551,39 @@ def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig, notes: dict[str, list[str]
     low_m = cfg.ground_z_m - SLAB_M if is_slab else cfg.ground_z_m + above_m
     if "z_m" in numbers:
         low_m = numbers["z_m"] - height_m / 2
-    try:
-        for part in parts:
-            for center, size, yaw_deg in _rectangles(part, numbers, row, notes):
-                boxes.add(kind, center, size, low_m, low_m + height_m, yaw_deg)
-    except ValueError as error:  # so far from the origin that its size is lost
-        raise _Skipped("bad_value", str(error)) from None
-    return source
+    return _Size(numbers, low_m, low_m + height_m, source)
 
 
-def _rectangles(part: Any, numbers: Mapping[str, float], row: _Row, notes: dict[str, list[str]]) -> Iterator[Rectangle]:
+def _rectangles(part: Any, numbers: Mapping[str, float], where: str, repairs: list[str]) -> Iterator[Rectangle]:
     """Yield the rectangles of a point, a line or an outline."""
     if isinstance(part, Point):
         yield Rectangle((part.x, part.y), (numbers["length_m"], numbers["width_m"]), numbers.get("yaw_deg", 0.0))
     elif isinstance(part, LineString):
         width_m = numbers["width_m"]
         for start, end in pairwise(np.asarray(part.simplify(LINE_M).coords)):
-            piece = end - start
-            if (length := float(np.hypot(*piece))) > 0:  # half of the width more, so that a bend has no gap
-                yaw_deg = float(np.degrees(np.arctan2(piece[1], piece[0])))
+            step = end - start
+            length = float(np.hypot(*step))
+            if length > 0:  # half of the width more, so that a bend has no gap
+                yaw_deg = float(np.degrees(np.arctan2(step[1], step[0])))
                 yield Rectangle(tuple((start + end) / 2), (length + width_m / 2, width_m), yaw_deg)
     else:
-        polygons = [part]
-        if not part.is_valid:
-            try:
-                check_outline(part, row.where)
-            except InputError as error:
-                raise _Skipped("bad_geometry", f"{error.what}: {error.got}") from None
-            polygons = polygons_of(shapely.make_valid(part))
-            if polygons:
-                notes["the outline crosses itself and is repaired"].append(row.where)
-        for polygon in polygons:
+        for polygon in _valid_polygons(part, where, repairs):
             pieces = cover(polygon, min_fill=OUTLINE_FILL, min_size_m=OUTLINE_PIECE_M, shares=CUT_SHARES)
-            small = [oriented_rectangle(polygon)] if not pieces and polygon.area > 0 else []
-            yield from pieces or (rectangle for rectangle in small if min(rectangle.size) > THINNEST_M)
+            if not pieces and polygon.area > 0:  # too small to be cut
+                rectangle = oriented_rectangle(polygon)
+                pieces = [rectangle] if min(rectangle.size) > THINNEST_M else []
+            yield from pieces
 
 
-def _number(value: Any) -> float:
+def _valid_polygons(outline: Polygon, where: str, repairs: list[str]) -> list[Polygon]:
+    """Return an outline as valid polygons; its place is added to `repairs` if it crosses itself."""
+    if outline.is_valid:
+        return [outline]
     try:
-        number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError):
-        return math.nan
-    return number if abs(number) <= LARGEST else math.nan
+        check_outline(outline, where)
+    except InputError as error:
+        raise _Skipped("bad_geometry", f"{error.what}: {error.got}") from None
+    polygons = polygons_of(shapely.make_valid(outline))
+    if polygons:
+        repairs.append(where)
+    return polygons

@@ -41,15 +41,13 @@ MOST_CUTS, MOST_CUTS_PER_CORNER = 30_000, 20  # of the polygons of a map; a city
 
 @dataclass
 class BoxList:
-    """A growing list of upright boxes in world metres, with ids from 1 in the order of adding.
-
-    frame: the place of the origin, m, and the yaw of the x axis, degrees, that positions refer to; None: the world's.
-    """
+    """A growing list of upright boxes in world metres, with ids from 1 in the order of adding."""
 
     rows: list[tuple[float, ...]] = field(default_factory=list)  # center 3, half extent 3, yaw_deg
     kinds: list[int] = field(default_factory=list)
-    num_cuts: float = 0.0
+    num_cuts: float = 0.0  # see `reserve`
     most_cuts: float = MOST_CUTS
+    # Positions refer to an origin, (2,) m, and the yaw of an x axis, degrees; None: those of the world.
     frame: tuple[Pair, float] | None = None
 
     def framed(self, origin: Pair, yaw_deg: float) -> BoxList:
@@ -66,8 +64,9 @@ class BoxList:
             raise ValueError(f"the box has no volume: {kind}, {footprint} m, height {low_m:g} to {high_m:g} m")
         if self.frame is not None:
             origin, turn_deg = self.frame
-            x, y = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
-            center_xy = np.add(origin, (x * center_xy[0] - y * center_xy[1], y * center_xy[0] + x * center_xy[1]))
+            cos, sin = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+            x, y = center_xy
+            center_xy = np.add(origin, (cos * x - sin * y, sin * x + cos * y))
             yaw_deg += turn_deg
         center = (float(center_xy[0]), float(center_xy[1]), (low_m + high_m) / 2)
         self.rows.append((*center, size_xy[0] / 2, size_xy[1] / 2, (high_m - low_m) / 2, float(yaw_deg)))
@@ -78,7 +77,8 @@ class BoxList:
         self.num_cuts += num_cuts
         self.most_cuts += MOST_CUTS_PER_CORNER * num_corners
         if self.num_cuts > self.most_cuts:
-            got, fix = f"outlines that need {self.num_cuts:,.0f} cuts", "cut out a part of the map, or simplify it"
+            got = f"outlines that need {self.num_cuts:,.0f} cuts"
+            fix = "cut out a part of the map, or simplify it"
             raise over_limit("map", got, f"{self.most_cuts:,.0f} cuts for this number of corners", fix)
 
     def span(self, kind: str, a: Pair, b: Pair, low_m: float, high_m: float) -> None:
@@ -99,12 +99,12 @@ class BoxList:
 
 
 class SkippedEntries:
-    """What a reader does not use of a file: numbers by reason, and the problems of bad entries with their places."""
+    """The entries of a file that a reader does not use, with the problems of bad ones."""
 
     def __init__(self) -> None:
-        self.counts = Counter[str]()
+        self.counts = Counter[str]()  # by reason
         self.num_bad = 0
-        self._places = defaultdict[str, list[str]](list)  # so that each problem is listed once
+        self._places = defaultdict[str, list[str]](list)  # by problem, so that each problem is listed once
 
     def add(self, reason: str, where: str = "", problem: str = "", *, is_bad: bool = True) -> None:
         """Count an entry; one with a problem is listed, and counts as bad unless `is_bad` is false."""
@@ -144,11 +144,13 @@ def check_not_empty(box_map: BoxMap, where: str, fix: str = "") -> None:
         raise InputError("the map has no boxes", where=where, got=got, expected=expected, fix=fix or None)
 
 
-def served(box_map: BoxMap, ground_z_m: float | None, is_road: np.ndarray, where: str, fix: str) -> BoxMap:
-    """Return the map of a server with a height of its ground, m; None: the median height of its roads.
+def with_server_ground(box_map: BoxMap, ground_z_m: float | None, is_road: np.ndarray, where: str, fix: str) -> BoxMap:
+    """Check and report the map of a server, and return it with the height of its ground.
 
     Args:
-        is_road: (n,) boxes that are roads of a known size. fix: What to do about a map without boxes.
+        ground_z_m: m; None: the median height of its roads.
+        is_road: (n,) boxes that are roads of a known size.
+        fix: What to do about a map without boxes.
     """
     check_not_empty(box_map, where, fix)
     if dropped := box_map.header.dropped_objects:
@@ -162,6 +164,7 @@ def served(box_map: BoxMap, ground_z_m: float | None, is_road: np.ndarray, where
 def required(path: Path | None, setting: str) -> Path:
     """Return the path of a setting; raise ConfigError if it is not set."""
     if path is None:
-        what, fix = "the setting is required, but has no value", f"pass --set {setting}=FILE"
+        what = "the setting is required, but has no value"
+        fix = f"pass --set {setting}=FILE"
         raise ConfigError(what, where=setting, expected="the path of a file", fix=fix)
     return path

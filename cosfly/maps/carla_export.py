@@ -9,14 +9,14 @@ from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from cosfly.formats.boxes import BoxMap, MapHeader, MapSource, make_box_map
 from cosfly.formats.kinds import KINDS
-from cosfly.maps.boxlist import GroundHeight, MapLicence, served
+from cosfly.maps.boxlist import GroundHeight, MapLicence, with_server_ground
 from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.io import sha256_bytes
 from cosfly.simulators.carla_client import CarlaConfig, connect
@@ -40,13 +40,22 @@ class CarlaMapConfig(CarlaConfig):
         return {}
 
 
+class CarlaObject(NamedTuple):
+    """One object, in the server's axes."""
+
+    label: str
+    number: int  # its id, which is not unique
+    name: str
+    box: tuple[float, ...]  # centre, half sizes, and pitch, yaw, roll
+
+
 @dataclass
 class CarlaTown:
-    """Answers of a server, in its own axes. rows: label's name, id, name of the object, and 9 numbers of its box."""
+    """Answers of a server."""
 
     town: str
     version: str
-    rows: list[tuple[str, int, str, tuple[float, ...]]] = field(default_factory=list)
+    rows: list[CarlaObject] = field(default_factory=list)
     empty_labels: list[str] = field(default_factory=list)
 
 
@@ -67,7 +76,7 @@ def ask(cfg: CarlaConfig) -> CarlaTown:
                 half = item.bounding_box.extent
                 turn = item.bounding_box.rotation
                 box = (center.x, center.y, center.z, half.x, half.y, half.z, turn.pitch, turn.yaw, turn.roll)
-                answers.rows.append((name, item.id, item.name, box))
+                answers.rows.append(CarlaObject(name, item.id, item.name, box))
     return answers
 
 
@@ -91,27 +100,31 @@ def box_map_of(answers: CarlaTown, cfg: CarlaMapConfig) -> BoxMap:
     rows = dict[int, tuple]()  # by id: centre, half sizes, rotation, kind
     for label, number, name, box in answers.rows:
         key = (label, *np.round(box, 3).tolist())
-        if reason := _unfit(label, np.array(box), cfg) or ("duplicate" if key in seen else ""):
+        reason = _drop_reason(label, np.array(box), cfg)
+        if not reason and key in seen:
+            reason = "duplicate"
+        if reason:
             dropped[reason] += 1
             continue
         seen.add(key)
-        if number in rows:
+        box_id = number
+        if box_id in rows:
             num_repeated += 1
-            number = int(sha256_bytes(f"{number} {name} {key}".encode())[:16], 16)
+            box_id = int(sha256_bytes(f"{number} {name} {key}".encode())[:16], 16)
         position_m, rotation_deg = world_pose((*box[:3], *box[6:]))
-        rows[number] = position_m, box[3:6], rotation_deg, KINDS[label]
+        rows[box_id] = position_m, box[3:6], rotation_deg, KINDS[label]
     header = MapHeader(
         name=cfg.name or answers.town, source=MapSource(tool="CARLA", version=answers.version, file=answers.town),
         licence=cfg.licence, credits=cfg.credits, extent_sources={"engine": len(rows)}, num_objects=len(answers.rows),
         dropped_objects=dict(dropped), empty_labels=answers.empty_labels, repeated_ids=num_repeated,
     )  # fmt: skip
-    centers, halves, turns, kinds = zip(*rows.values(), strict=True) if rows else ((),) * 4
+    centers, halves, turns, kinds = ([row[k] for row in rows.values()] for k in range(4))
     box_map = make_box_map(centers, halves, turns, kinds, list(rows), header)
     fix = "load a town whose objects have bounding boxes"
-    return served(box_map, cfg.ground_z_m, box_map.kinds == KINDS["Roads"], where, fix)
+    return with_server_ground(box_map, cfg.ground_z_m, box_map.kinds == KINDS["Roads"], where, fix)
 
 
-def _unfit(label: str, box: np.ndarray, cfg: CarlaMapConfig) -> str:
+def _drop_reason(label: str, box: np.ndarray, cfg: CarlaMapConfig) -> str:
     """Return why a box is dropped; an empty text if it is kept."""
     if not np.isfinite(box).all():
         return "not finite"

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import shapely
@@ -36,6 +36,41 @@ from cosfly.runtime.config import Config
 
 log = logging.getLogger(__name__)
 
+# Shape of boxes: share of its boxes that a footprint fills; pieces that are no longer, m, are not cut again.
+SOLID_FILL, SOLID_PIECE_M = 0.9, 3.0
+WALL_FILL, WALL_PIECE_M = 0.6, 1.0
+SURFACE_FILL, SURFACE_PIECE_M = 0.8, 2.0
+WATER_FILL, WATER_PIECE_M = 0.97, 1.5  # an obstacle that must not spill over quays and bridges
+SURFACE_MAX_M = 60.0  # longer slabs are cut even if full
+STEEP = 0.02  # a surface with a projection of less than this share of its area is a wall: it has no footprint
+
+# Heights.
+SLAB_M = 0.3
+WALL_MAX_M = 2.5  # highest wall: laser heights are often of trees above
+FOOT_M = 0.01  # vertices this near to the lowest one are the solid's foot
+EDGE_M = 0.05  # parts that only touch a rectangle are not over it
+# Tops of surfaces over the ground. Where slabs overlap a little the higher kind is seen, so paths cover roads and roads
+# cover lawns.
+SURFACE_TOPS_M = {
+    "Sidewalks": 0.0, "Bridge": -0.02, "Walls": 0.0, "Roads": -0.03, "RailTrack": -0.03, "Ground": -0.05,
+    "Terrain": -0.1, "Water": -0.07,
+}  # fmt: skip
+
+# Trees.
+CANOPY_M, CANOPY_MAX_M = 2.5, 40.0  # green that rises higher over the ground is a tree; tallest tree
+CANOPY_CELL_M = 2.0  # raster cell of canopies
+MOST_CELLS = 400_000  # of all canopies; vast ones get larger cells
+CROWN_CELLS, CROWN_MIN_M = 3, 3.6  # cells along a tree's side at most; least width of a crown: plots are smaller
+
+# The ground. Surfaces that people walk on at the file's height; not water, which is lower than its banks, nor green,
+# with the canopy in its vertices.
+TERRAIN_KINDS = ("Roads", "Sidewalks", "Ground", "Terrain", "RailTrack")
+FLAT_WITHIN_M = 3.0  # ground that rises less over the whole map keeps its heights
+REPORTED_RISE_M = 1.0  # a smaller rise is kerbs and steps
+RISE_SHARES = (2, 98)  # percentiles: a few stray vertices do not tilt a town
+FAR_M = 100 * WIDEST_M  # of corners beyond all samples, so that the ground of the border goes on
+SAME_PLACE_M = 0.1  # vertices nearer than this are one, at their mean height
+
 
 class CityJsonConfig(Config):
     """A CityJSON city model."""
@@ -59,8 +94,21 @@ class CityJsonConfig(Config):
         return {"city_model": required(self.path, "maps.cityjson.path")}
 
 
-# The projection of a surface that is not upright, and its plane z = a x + b y + c.
-Facet = tuple[Polygon, np.ndarray]
+class Facet(NamedTuple):
+    """The projection of a surface that is not upright, and its plane z = a x + b y + c."""
+
+    polygon: Polygon
+    plane: np.ndarray  # (3,): a, b, c
+
+
+class Crown(NamedTuple):
+    """The cells of one tree in the raster of a canopy; the ends are excluded."""
+
+    x0: int
+    y0: int
+    x1: int
+    y1: int
+    height_m: float
 
 
 def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
@@ -84,31 +132,36 @@ def _boxes_of(objects: list[CityObject], cfg: CityJsonConfig, dropped: Counter[s
 
     An object without a box is counted in `dropped`.
     """
-    facets = {item.object_id: _facets(item) for item in objects}
-    footprints = {key: united([polygon for polygon, _ in value]) for key, value in facets.items()}
-    greens = [item for item in objects if item.rule.form == "green" and facets[item.object_id]]
+    facets_of = {item.object_id: _facets(item) for item in objects}
+    footprints = {key: united([facet.polygon for facet in facets]) for key, facets in facets_of.items()}
+    greens = [item for item in objects if item.rule.form == "green" and facets_of[item.object_id]]
     cell_m = _canopy_cell_m(greens)
-    boxes, meshes = BoxList(), Meshes()
+    boxes = BoxList()
+    meshes = Meshes()
     for item in objects:
-        footprint, kind, form = footprints[item.object_id], item.rule.kind, item.rule.form
+        footprint = footprints[item.object_id]
+        kind = item.rule.kind
         num_before = len(boxes)
-        if form == "solid":
+        if item.rule.form == "solid":
             _add_solid(boxes, meshes, cfg, item, footprint)
-        elif form == "wall":
+        elif item.rule.form == "wall":
             _add_wall(boxes, item, footprint)
-        elif kind != "Water":  # all water is added last
+        elif kind == "Water":  # all water is added last
+            continue
+        else:
             _add_surface(boxes, kind, footprint)
-            if form == "green" and facets[item.object_id]:
-                _add_trees(boxes, item, facets[item.object_id], cell_m)
+            facets = facets_of[item.object_id]
+            if item.rule.form == "green" and facets:
+                _add_trees(boxes, item, facets, cell_m)
         if kind == "Bridge":
             _add_surface(boxes, "Sidewalks", footprint)  # for pedestrians
-        dropped["no_footprint"] += kind != "Water" and len(boxes) == num_before
+        if len(boxes) == num_before:
+            dropped["no_footprint"] += 1
     water = _open_water(objects, footprints)
     _add_surface(boxes, "Water", water)
     for item in objects:
-        if item.rule.kind == "Water":
-            is_open = shapely.intersection(footprints[item.object_id], water).area > MIN_AREA_M2
-            dropped["under_other_surfaces"] += not is_open
+        if item.rule.kind == "Water" and shapely.intersection(footprints[item.object_id], water).area <= MIN_AREA_M2:
+            dropped["under_other_surfaces"] += 1
     return boxes, meshes
 
 
@@ -131,7 +184,7 @@ def _centred(objects: list[CityObject], path: Path) -> tuple[list[CityObject], n
     return [item.moved(lambda ring: ring - origin) for item in objects], origin
 
 
-STEEP = 0.02  # a surface with a projection of less than this share of its area is a wall: it has no footprint
+# --- footprints -------------------------------------------------------------------------------------------------------
 
 
 def _facets(item: CityObject) -> list[Facet]:
@@ -148,7 +201,7 @@ def _facets(item: CityObject) -> list[Facet]:
         plane = np.array([a, b, middle[2] - a * middle[0] - b * middle[1]])
         polygon = Polygon(ring[:, :2], [hole[:, :2] for hole in holes])
         check_outline(polygon, item.object_id)
-        facets.append((polygon, plane))
+        facets.append(Facet(polygon, plane))
     return facets
 
 
@@ -161,13 +214,7 @@ def _pieces(boxes: BoxList, footprint: Any, tolerance_m: float, **settings: Any)
         yield from cover(simple, **settings)
 
 
-# Share of its boxes that a shape fills; pieces of at most this length are not cut again, m.
-SOLID_FILL, SOLID_PIECE_M = 0.9, 3.0
-WALL_FILL, WALL_PIECE_M = 0.6, 1.0
-WALL_MAX_M = 2.5  # highest wall: laser heights are often of trees above
-SLAB_M = 0.3
-FOOT_M = 0.01  # vertices this near to the lowest one are the solid's foot
-EDGE_M = 0.05  # parts that only touch a rectangle are not over it
+# --- solids and walls -------------------------------------------------------------------------------------------------
 
 
 def _add_solid(boxes: BoxList, meshes: Meshes, cfg: CityJsonConfig, item: CityObject, footprint: Any) -> None:
@@ -251,19 +298,7 @@ def _triangles_of(rings: Surface) -> np.ndarray:
     return np.array(triangles).reshape(-1, 3, 3)
 
 
-SURFACE_FILL, SURFACE_PIECE_M = 0.8, 2.0
-WATER_FILL, WATER_PIECE_M = 0.97, 1.5  # an obstacle that must not spill over quays and bridges
-SURFACE_MAX_M = 60.0  # longer slabs are cut even if full
-# Over the ground. Where slabs overlap a little the higher kind is seen, so paths cover roads and roads cover lawns.
-SURFACE_TOPS_M = {
-    "Sidewalks": 0.0, "Bridge": -0.02, "Walls": 0.0, "Roads": -0.03, "RailTrack": -0.03, "Ground": -0.05,
-    "Terrain": -0.1, "Water": -0.07,
-}  # fmt: skip
-
-CANOPY_M, CANOPY_MAX_M = 2.5, 40.0  # green that rises higher over the ground is a tree; tallest tree
-CANOPY_CELL_M = 2.0  # raster cell of canopies
-MOST_CELLS = 400_000  # of all canopies; vast ones get larger cells
-CROWN_CELLS, CROWN_MIN_M = 3, 3.6  # cells along a tree's side at most; least width of a crown: plots are smaller
+# --- surfaces and trees -----------------------------------------------------------------------------------------------
 
 
 def _add_surface(boxes: BoxList, kind: str, footprint: Any) -> None:
@@ -288,10 +323,11 @@ def _canopy_cell_m(greens: list[CityObject]) -> float:
 def _add_trees(boxes: BoxList, item: CityObject, facets: list[Facet], cell_m: float) -> None:
     """Add a vegetation box for every patch of raster cells where the green rises over CANOPY_M."""
     heights_m, first_cell = _canopy_heights(item, facets, cell_m)
-    for x0, y0, x1, y1, top_m in _crowns(heights_m):
-        begin, end = np.add(first_cell, (x0, y0)), np.add(first_cell, (x1, y1))
+    for crown in _crowns(heights_m):
+        begin = np.add(first_cell, (crown.x0, crown.y0))
+        end = np.add(first_cell, (crown.x1, crown.y1))
         size_m = np.maximum((end - begin) * cell_m, CROWN_MIN_M)
-        boxes.add("Vegetation", (begin + end) / 2 * cell_m, size_m, 0.0, min(top_m, CANOPY_MAX_M))
+        boxes.add("Vegetation", (begin + end) / 2 * cell_m, size_m, 0.0, min(crown.height_m, CANOPY_MAX_M))
 
 
 def _canopy_heights(item: CityObject, facets: list[Facet], cell_m: float) -> tuple[np.ndarray, np.ndarray]:
@@ -299,33 +335,35 @@ def _canopy_heights(item: CityObject, facets: list[Facet], cell_m: float) -> tup
 
     Return heights (nx, ny) m, 0 off the surface, and the indices (2,) of the first cell: low corner / cell_m.
     """
-    bounds = np.array([polygon.bounds for polygon, _ in facets])
+    bounds = np.array([facet.polygon.bounds for facet in facets])
     corners = item.corners()
     first_cell = np.floor(np.minimum(bounds[:, :2].min(axis=0), corners[:, :2].min(axis=0)) / cell_m).astype(int)
     last_cell = np.floor(np.maximum(bounds[:, 2:].max(axis=0), corners[:, :2].max(axis=0)) / cell_m).astype(int)
     heights_m = np.zeros(last_cell - first_cell + 1)
     cells = np.floor(corners[:, :2] / cell_m).astype(int) - first_cell
     np.maximum.at(heights_m, (cells[:, 0], cells[:, 1]), corners[:, 2])
-    for (polygon, (a, b, c)), facet_bounds in zip(facets, bounds, strict=True):
+    for facet, facet_bounds in zip(facets, bounds, strict=True):
         # The cells with their middle in the facet's bounds: none where the facet lies between the middles.
         begin = np.ceil(facet_bounds[:2] / cell_m - 0.5).astype(int)
         end = np.floor(facet_bounds[2:] / cell_m - 0.5).astype(int) + 1
         grids = np.meshgrid(np.arange(begin[0], end[0]), np.arange(begin[1], end[1]), indexing="ij")
-        ix, iy = (grid.ravel() for grid in grids)
-        x, y = (ix + 0.5) * cell_m, (iy + 0.5) * cell_m
-        inside = shapely.intersects_xy(polygon, x, y)
+        cells = np.stack([grid.ravel() for grid in grids], axis=1)
+        x, y = (cells.T + 0.5) * cell_m
+        a, b, c = facet.plane
         z = a * x + b * y + c
-        np.maximum.at(heights_m, (ix[inside] - first_cell[0], iy[inside] - first_cell[1]), z[inside])
+        inside = shapely.intersects_xy(facet.polygon, x, y)
+        cells = cells[inside] - first_cell
+        np.maximum.at(heights_m, (cells[:, 0], cells[:, 1]), z[inside])
     return heights_m, first_cell
 
 
-def _crowns(heights_m: np.ndarray) -> list[tuple[int, int, int, int, float]]:
+def _crowns(heights_m: np.ndarray) -> list[Crown]:
     """Gather the cells of a canopy, heights (nx, ny) m, into trees, the highest first.
 
-    Every cell over CANOPY_M is in exactly one tree: (x0, y0, x1, y1, height), indices with the ends excluded, and m.
+    Every cell over CANOPY_M is in exactly one tree.
     """
     is_free = heights_m > CANOPY_M
-    trees = []
+    crowns = []
     for flat_index in np.argsort(-heights_m, axis=None, kind="stable"):
         x, y = (int(index) for index in np.unravel_index(flat_index, heights_m.shape))
         if not heights_m[x, y] > CANOPY_M:
@@ -333,8 +371,8 @@ def _crowns(heights_m: np.ndarray) -> list[tuple[int, int, int, int, float]]:
         if is_free[x, y]:
             x0, y0, x1, y1 = _grown(is_free, x, y)
             is_free[x0:x1, y0:y1] = False
-            trees.append((x0, y0, x1, y1, float(heights_m[x0:x1, y0:y1].max())))
-    return trees
+            crowns.append(Crown(x0, y0, x1, y1, float(heights_m[x0:x1, y0:y1].max())))
+    return crowns
 
 
 def _grown(is_free: np.ndarray, x: int, y: int) -> tuple[int, int, int, int]:
@@ -343,6 +381,7 @@ def _grown(is_free: np.ndarray, x: int, y: int) -> tuple[int, int, int, int]:
     before = (0, 0, 0, 0)
     while tree != before:
         before = tree
+        # One more column in the west or east, or row in the south or north; of several that fit the last counts.
         for step in ((-1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1)):
             x0, y0, x1, y1 = (side + change for side, change in zip(before, step, strict=True))
             fits = x0 >= 0 and y0 >= 0 and x1 <= is_free.shape[0] and y1 <= is_free.shape[1]
@@ -351,14 +390,7 @@ def _grown(is_free: np.ndarray, x: int, y: int) -> tuple[int, int, int, int]:
     return tree
 
 
-# Surfaces that people walk on at the file's height. Not water, which is lower than its banks, nor green, with the
-# canopy in its vertices.
-TERRAIN_KINDS = ("Roads", "Sidewalks", "Ground", "Terrain", "RailTrack")
-FLAT_WITHIN_M = 3.0  # ground that rises less over the whole map keeps its heights
-REPORTED_RISE_M = 1.0  # a smaller rise is kerbs and steps
-RISE_SHARES = (2, 98)  # percentiles: a few stray vertices do not tilt a town
-FAR_M = 100 * WIDEST_M  # of corners beyond all samples, so that the ground of the border goes on
-SAME_PLACE_M = 0.1  # vertices nearer than this are one, at their mean height
+# --- flat ground ------------------------------------------------------------------------------------------------------
 
 
 def _flattened(objects: list[CityObject]) -> list[CityObject]:

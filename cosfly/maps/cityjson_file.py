@@ -28,7 +28,9 @@ log = logging.getLogger(__name__)
 
 CITY_MB = 16_384  # on disk and unpacked; as values of Python it takes ten times that
 MOST_VERTICES = 100_000  # of a surface, its holes included
-FLAT_M, STOREY_M, HIGHEST_M = 0.01, 3.0, 2_000.0  # a footprint is flatter; of a storey; of a building
+FLAT_M = 0.01  # an object whose heights differ by less is a footprint
+STOREY_M = 3.0
+HIGHEST_M = 2_000.0  # of a building
 VERSIONS = ("1.1", "2.0")
 RECORD_SEPARATOR = b"\x1e"  # before each text of a sequence of RFC 7464
 VALIDATE = "check the file with `cjio FILE validate`"
@@ -61,16 +63,12 @@ RULES = [ObjectRule(**fields) for fields in read_yaml(Path(__file__).with_name("
 
 
 class CityObject(NamedTuple):
-    """One object.
-
-    surfaces: those of the coarsest geometry with a height; boxes are made of them. detailed: those of the most
-    detailed geometry of a solid; the renderer draws them.
-    """
+    """One object."""
 
     object_id: str
     rule: ObjectRule
-    surfaces: list[Surface]
-    detailed: list[Surface]
+    surfaces: list[Surface]  # of the coarsest geometry with a height; boxes are made of them
+    detailed: list[Surface]  # of the most detailed geometry of a solid; the renderer draws them
 
     def corners(self) -> np.ndarray:
         """Return all vertices, (n, 3) m."""
@@ -86,11 +84,11 @@ class CityObject(NamedTuple):
 
 
 class CityModel(NamedTuple):
-    """The objects that a rule covers, and those that are not used."""
+    """The content of a file."""
 
-    objects: list[CityObject]
-    dropped: SkippedEntries
-    num_objects: int
+    objects: list[CityObject]  # that are used
+    dropped: SkippedEntries  # the others
+    num_objects: int  # of both
     version: str
 
 
@@ -141,20 +139,17 @@ def read_model(path: Path, units: Units, most_skipped: float) -> CityModel:
 
     most_skipped: The largest share of objects that may be skipped because they are invalid.
     """
-    version, head, features = _read_parts(path)
-    if units == "auto":
-        declared = head.metadata.get("referenceSystem") if isinstance(head.metadata, dict) else None
-        units = declared_units(declared, f"{path}: metadata.referenceSystem") or "m"
-        if units == "degrees":
-            raise refused(str(declared), f"{path}: metadata.referenceSystem")
-    objects = dict[str, CityObject]()
+    version, document, features = _read_parts(path)
+    unit_m = METRES[_units_of(document, path) if units == "auto" else units]
+    objects = list[CityObject]()
     seen_ids = set[str]()
     num_objects = 0
     dropped = SkippedEntries()
-    for where, part in [(str(path), head), *features] if head.objects else features:
+    parts: list[tuple[str, _Part]] = [(str(path), document)] if document.objects else []
+    for where, part in [*parts, *features]:
         with np.errstate(all="ignore"):  # each ring is checked for finite numbers
-            vertices = _vectors(part.vertices, f"{where}: vertices") * head.scale + head.translate
-            vertices *= METRES[units]
+            vertices = _vectors(part.vertices, f"{where}: vertices") * document.scale + document.translate
+            vertices *= unit_m
         num_objects += len(part.objects)
         for object_id, value in part.objects.items():
             place = f"{where}: CityObjects.{object_id}"
@@ -163,22 +158,34 @@ def read_model(path: Path, units: Units, most_skipped: float) -> CityModel:
                 continue
             seen_ids.add(object_id)
             try:
-                objects[object_id] = _city_object(object_id, validated(_Object, value, place), part, vertices, place)
+                objects.append(_city_object(object_id, validated(_Object, value, place), part, vertices, place))
             except _Dropped as error:
                 dropped.add(str(error))
             except InputError as error:
                 dropped.add("invalid", str(error.where), str(error).removeprefix(f"{error.where}: "))
-    middle = np.median([item.corners().mean(axis=0) for item in objects.values()] or [np.zeros(3)], axis=0)
-    for object_id, item in list(objects.items()):
-        if (np.abs(item.corners() - middle) > WIDEST_M).any():
-            dropped.add("far_away", object_id, "it is more than 20 km from the middle of the map")
-            del objects[object_id]
+    middle = np.median([item.corners().mean(axis=0) for item in objects] or [np.zeros(3)], axis=0)
+    near = []
+    for item in objects:
+        if (np.abs(item.corners() - middle) <= WIDEST_M).all():
+            near.append(item)
+        else:
+            dropped.add("far_away", item.object_id, "it is more than 20 km from the middle of the map")
     dropped.check(path, num_objects, most_skipped, f"at most {most_skipped:.0%} invalid or far objects")
-    if not objects:
+    if not near:
         counts = f"dropped objects: {counts_text(dropped.counts)}" if dropped.counts else "no objects"
         expected = "an object with a geometry and a supported type, such as Building"
         raise InputError("the file has no usable object", where=f"{path}: CityObjects", got=counts, expected=expected)
-    return CityModel(list(objects.values()), dropped, num_objects, version)
+    return CityModel(near, dropped, num_objects, version)
+
+
+def _units_of(document: _Document, path: Path) -> Units:
+    """Return the units that a document declares, else metres; raise InputError for degrees."""
+    declared = document.metadata.get("referenceSystem") if isinstance(document.metadata, dict) else None
+    where = f"{path}: metadata.referenceSystem"
+    units = declared_units(declared, where) or "m"
+    if units == "degrees":
+        raise refused(str(declared), where)
+    return units
 
 
 def _read_parts(path: Path) -> tuple[str, _Document, list[tuple[str, _Part]]]:
@@ -188,32 +195,33 @@ def _read_parts(path: Path) -> tuple[str, _Document, list[tuple[str, _Part]]]:
     texts = [(str(path), data)]
     if len(lines) > 1 and b'"CityJSONFeature"' in data and lines[0].rstrip().endswith(b"}"):  # not of one document
         texts = [(f"{path}: line {k + 1}", line) for k, line in enumerate(lines) if line.strip()]
-    version = ""
-    parts = list[tuple[str, Any]]()
-    for where, text in texts:
-        value = parse_document(text, where)
-        object_type = shown(value.get("type")) if isinstance(value, dict) else json_type(value)
-        expected = "CityJSONFeature" if parts else "CityJSON"
-        if object_type != repr(expected):
-            raise InputError(
-                f"the JSON object is not a {expected} object",
-                where=f"{where}: type",
-                got=object_type,
-                expected=repr(expected),
-                fix="pass a CityJSON file, or a sequence of a CityJSON object and CityJSONFeature objects",
-            )
-        if not parts:
-            version = ".".join(str(value.get("version")).split(".")[:2])  # 1.1.3 is 1.1
-            if version not in VERSIONS:
-                raise InputError(
-                    "the version of CityJSON is not supported",
-                    where=f"{where}: version",
-                    got=shown(value.get("version")),
-                    expected=" or ".join(VERSIONS),
-                    fix="convert the file, for instance with `cjio OLD upgrade save NEW`",
-                )
-        parts.append((where, validated(_Part if parts else _Document, value, where)))
-    return version, parts[0][1], parts[1:]
+    where, text = texts[0]
+    value = _object_of_type("CityJSON", text, where)
+    version = ".".join(str(value.get("version")).split(".")[:2])  # 1.1.3 is 1.1
+    if version not in VERSIONS:
+        raise InputError(
+            "the version of CityJSON is not supported",
+            where=f"{where}: version",
+            got=shown(value.get("version")),
+            expected=" or ".join(VERSIONS),
+            fix="convert the file, for instance with `cjio OLD upgrade save NEW`",
+        )
+    document = validated(_Document, value, where)
+    features: list[tuple[str, _Part]] = []
+    for where, text in texts[1:]:
+        features.append((where, validated(_Part, _object_of_type("CityJSONFeature", text, where), where)))
+    return version, document, features
+
+
+def _object_of_type(expected: str, text: bytes, where: str) -> dict[str, Any]:
+    """Return the JSON object in a text; raise InputError if it is not of the expected type of CityJSON."""
+    value = parse_document(text, where)
+    object_type = shown(value.get("type")) if isinstance(value, dict) else json_type(value)
+    if object_type != repr(expected):
+        what = f"the JSON object is not a {expected} object"
+        fix = "pass a CityJSON file, or a sequence of a CityJSON object and CityJSONFeature objects"
+        raise InputError(what, where=f"{where}: type", got=object_type, expected=repr(expected), fix=fix)
+    return value
 
 
 def _vectors(values: list[Any], where: str) -> np.ndarray:
@@ -233,30 +241,28 @@ def _city_object(object_id: str, item: _Object, part: _Part, vertices: np.ndarra
         log.warning("%s: dropped, because cosfly has no rule for the type %s", object_id, item.type)
         raise _Dropped("unmapped_type")
     geometries = item.geometry or []
-    usable = [k for k, geometry in enumerate(geometries) if geometry.type in GEOMETRIES]
-    if not usable:
+    levels = {k: geometry.level for k, geometry in enumerate(geometries) if geometry.type in GEOMETRIES}
+    if not levels:
         raise _Dropped("no_geometry")
-
-    def level(k: int) -> float:
-        return geometries[k].level
 
     def surfaces_of(k: int) -> list[Surface]:
         return _surfaces(geometries[k], vertices, f"{where}.geometry[{k}].boundaries")
 
-    coarsest = min(usable, key=lambda k: (level(k) < 1, level(k)))  # level 0 has no height
-    finest = max(usable, key=level)
+    coarsest = min(levels, key=lambda k: (levels[k] < 1, levels[k]))  # level 0 has no height
+    finest = max(levels, key=levels.__getitem__)
     surfaces = surfaces_of(coarsest)
     if not surfaces:
         raise _Dropped("no_geometry")
     if rule.form != "solid":
         return CityObject(object_id, rule, surfaces, [])
     children = item.children if isinstance(item.children, list) else []
-    if level(coarsest) < 1 and any(isinstance(child, str) and child in part.objects for child in children):
+    if levels[coarsest] < 1 and any(isinstance(child, str) and child in part.objects for child in children):
         raise _Dropped("outline_of_parts")  # its parts have the walls; the outline would hide their courtyards
     heights = np.concatenate([ring[:, 2] for surface in surfaces for ring in surface])
-    if np.ptp(heights) < FLAT_M and (height_m := _height_of(item, is_needed=rule.kind == "Buildings")):
-        surfaces = _raised(surfaces, height_m)
-        return CityObject(object_id, rule, surfaces, surfaces)
+    height_m = _height_of(item, is_needed=rule.kind == "Buildings") if np.ptp(heights) < FLAT_M else 0.0
+    if height_m:
+        solid = _raised(surfaces, height_m)
+        return CityObject(object_id, rule, solid, solid)
     return CityObject(object_id, rule, surfaces, surfaces if finest == coarsest else surfaces_of(finest))
 
 
@@ -287,13 +293,16 @@ def _raised(surfaces: list[Surface], height_m: float) -> list[Surface]:
 
 def _surfaces(geometry: _Geometry, vertices: np.ndarray, where: str) -> list[Surface]:
     """Return the surfaces of a geometry; for a solid those of its outer shell."""
-    shells = geometry.boundaries  # of a solid
     if geometry.type.endswith("Surface"):
         shells = [geometry.boundaries]
-    elif geometry.type != "Solid":
-        shells = [shell for solid in shells for shell in (solid[:1] if isinstance(solid, list) else [solid])]
+    elif geometry.type == "Solid":
+        shells = geometry.boundaries[:1]  # the outer one
+    else:
+        shells = []
+        for solid in geometry.boundaries:
+            shells += solid[:1] if isinstance(solid, list) else [solid]
     try:
-        outer = validated(_Shells, shells[:1] if geometry.type == "Solid" else shells, where)
+        outer = validated(_Shells, shells, where)
     except InputError as error:
         expected = "nested lists of rings of at least three indices of vertices"
         raise InputError(error.what, where=error.where, got=error.got, expected=expected, fix=VALIDATE) from error
@@ -302,13 +311,16 @@ def _surfaces(geometry: _Geometry, vertices: np.ndarray, where: str) -> list[Sur
 
 def _rings(surface: _Surface, vertices: np.ndarray, where: str) -> Surface:
     """Return the rings of a surface, the outline first; raise InputError for vertices that cannot be used."""
-    if (highest := max(map(max, surface))) >= len(vertices):
-        what, expected = "the ring refers to a vertex that does not exist", f"an index from 0 to {len(vertices) - 1}"
+    highest = max(map(max, surface))
+    if highest >= len(vertices):
+        what = "the ring refers to a vertex that does not exist"
+        expected = f"an index from 0 to {len(vertices) - 1}"
         raise InputError(what, where=where, got=str(highest)[:60], expected=expected, fix=VALIDATE)
     rings = [vertices[ring] for ring in surface]
     if not all(np.isfinite(ring).all() for ring in rings):
         raise InputError("a coordinate is not a finite number", where=where, fix=VALIDATE)
-    if (num_vertices := sum(map(len, rings))) > MOST_VERTICES:
+    num_vertices = sum(map(len, rings))
+    if num_vertices > MOST_VERTICES:
         got = f"a surface of {num_vertices:,} vertices"
         raise over_limit(where, got, f"{MOST_VERTICES:,} vertices", "simplify the surface")
     return rings

@@ -28,10 +28,18 @@ MOST_NEW_CORNERS = 50_000  # of merged outlines that cross each other
 MAX_DEPTH = 16  # of cuts
 # Pieces of a polygon by its outline, and by its area: a larger one gets larger pieces. Cuts at shares take longer.
 MOST_PIECES, MOST_PIECES_OF_SHARES = 1_000, 400
-
 CUT_SHARES = (0.25, 0.4, 0.5, 0.6, 0.75)  # where houses may be cut
 
-Share = tuple[float, float]
+# Derived ground.
+PAVEMENT_M = 2.5  # pedestrians keep half a metre from walls
+NEAR_M = 25.0  # asphalt lies between facades up to this far apart
+NARROW_M = 4.0  # narrower asphalt is a leftover of corners
+VERGE_M = 10.0  # of lawn around the map
+GROUND_SLAB_M, LAWN_TOP_M = 0.3, -0.1  # asphalt and pavement lie in the ground's plane
+CREDITS = "Streets, pavements and lawn are derived by cosfly from the buildings, not mapped."
+
+Interval = tuple[float, float]
+WHOLE: Interval = (-0.6, 0.6)  # of a rectangle, and a little more
 
 
 class Rectangle(NamedTuple):
@@ -55,7 +63,7 @@ def oriented_rectangle(polygon: Polygon) -> Rectangle:
     edges = np.diff(hull, axis=0)
     angles = np.unique(np.round(np.mod(np.arctan2(edges[:, 1], edges[:, 0]), np.pi / 2), 9))
     cos, sin = np.cos(angles)[:, None], np.sin(angles)[:, None]
-    along = cos * hull[:, 0] + sin * hull[:, 1]
+    along = cos * hull[:, 0] + sin * hull[:, 1]  # (angles, corners): the hull in the axes of each angle
     across = cos * hull[:, 1] - sin * hull[:, 0]
     sizes = np.stack([np.ptp(along, axis=1), np.ptp(across, axis=1)], axis=1)
     best = int(np.argmin(sizes.prod(axis=1)))
@@ -72,8 +80,8 @@ def footprints(box_map: BoxMap) -> np.ndarray:
     return shapely.polygons(corners[:, [0, 2, 6, 4], :2])
 
 
-def rectangle_polygon(rectangle: Rectangle, along: Share = (-0.5, 0.5), across: Share = (-0.5, 0.5)) -> Polygon:
-    """Return a rectangle as a polygon, or its part within shares of its sizes, counted from the middle."""
+def rectangle_polygon(rectangle: Rectangle, along: Interval = (-0.5, 0.5), across: Interval = (-0.5, 0.5)) -> Polygon:
+    """Return a rectangle as a polygon, or its part within intervals, in shares of its sizes from the middle."""
     yaw = np.radians(rectangle.yaw_deg)
     x = np.array([np.cos(yaw), np.sin(yaw)]) * rectangle.size[0]
     y = np.array([-np.sin(yaw), np.cos(yaw)]) * rectangle.size[1]
@@ -92,9 +100,9 @@ def cover(
     """Cover a valid polygon, but not its holes and pieces below MIN_AREA_M2, with oriented rectangles.
 
     A piece is done when its rectangle's longer side is at most `min_size_m`, or at most `max_size_m` and the piece
-    fills it to `min_fill`. Otherwise it is cut across the longer side, at the share of it (with several shares: across
-    the side and at the share) that leaves the least empty area. Both sizes grow with a very large polygon, so that a
-    few corners cannot ask for a million pieces.
+    fills it to `min_fill`. Otherwise it is cut in two across the longer side. With several shares it may also be cut
+    across the other side, and the cut that leaves the least empty area is chosen. Both sizes grow with a very large
+    polygon, so that a few corners cannot ask for a million pieces.
     """
     min_size_m, max_size_m = _sizes_for(polygon, min_size_m, max_size_m, shares)
     done: list[Rectangle] = []
@@ -131,22 +139,27 @@ def num_cuts(polygon: Polygon, min_size_m: float, max_size_m: float, shares: Seq
 def _cut(piece: Polygon, rectangle: Rectangle, shares: Sequence[float]) -> list[Polygon]:
     """Cut a piece at one of the shares of its rectangle; see `cover`."""
     longer = 0 if rectangle.size[0] >= rectangle.size[1] else 1
-    whole = (-0.6, 0.6)  # a little more than the rectangle
+    if len(shares) == 1:
+        return _cut_at(piece, rectangle, longer, shares[0])
     least_m2 = np.inf
     best: list[Polygon] = []
-    for axis in (longer, 1 - longer) if len(shares) > 1 else (longer,):
+    for axis in (longer, 1 - longer):
         for share in shares:
-            parts: list[Polygon] = []
-            for window in ((whole[0], share - 0.5), (share - 0.5, whole[1])):
-                along, across = (window, whole) if axis == 0 else (whole, window)
-                parts += polygons_of(shapely.intersection(piece, rectangle_polygon(rectangle, along, across)))
-            if len(shares) == 1:
-                return parts
+            parts = _cut_at(piece, rectangle, axis, share)
             empty_m2 = sum(float(np.prod(oriented_rectangle(part).size)) for part in parts) - piece.area
             if empty_m2 < least_m2 - 1e-9:
                 least_m2 = empty_m2
                 best = parts
     return best
+
+
+def _cut_at(piece: Polygon, rectangle: Rectangle, axis: int, share: float) -> list[Polygon]:
+    """Cut a piece across a side of its rectangle, 0 or 1, at a share of the side."""
+    parts: list[Polygon] = []
+    for interval in ((WHOLE[0], share - 0.5), (share - 0.5, WHOLE[1])):
+        along, across = (interval, WHOLE) if axis == 0 else (WHOLE, interval)
+        parts += polygons_of(shapely.intersection(piece, rectangle_polygon(rectangle, along, across)))
+    return parts
 
 
 def check_outline(polygon: Polygon, where: str) -> None:
@@ -185,13 +198,6 @@ def united(polygons: list[Polygon]) -> BaseGeometry:
 
 # --- derived ground: pavement along facades, asphalt between near buildings, lawn elsewhere ---------------------------
 
-PAVEMENT_M = 2.5  # pedestrians keep half a metre from walls
-NEAR_M = 25.0  # asphalt lies between facades up to this far apart
-NARROW_M = 4.0  # narrower asphalt is a leftover of corners
-VERGE_M = 10.0  # of lawn around the map
-GROUND_SLAB_M, LAWN_TOP_M = 0.3, -0.1  # asphalt and pavement lie in the ground's plane
-CREDITS = "Streets, pavements and lawn are derived by cosfly from the buildings, not mapped."
-
 
 def with_derived_ground(box_map: BoxMap) -> BoxMap:
     """Return a map with derived ground; the same map if it has streets, pavements or squares, or no buildings."""
@@ -217,8 +223,9 @@ def with_derived_ground(box_map: BoxMap) -> BoxMap:
     derived.centers[:, 2] += box_map.ground_z_m
     derived.ids[:] = np.setdiff1d(np.arange(1, len(box_map) + len(derived) + 1), box_map.ids)[: len(derived)]
     header = box_map.header
-    update = {
-        "derived_ground": len(derived), "added_boxes": header.added_boxes + len(derived),
+    changes = {
+        "derived_ground": len(derived),
+        "added_boxes": header.added_boxes + len(derived),
         "credits": f"{header.credits.rstrip('. ')}. {CREDITS}".removeprefix(". "),
-    }  # fmt: skip
-    return replace(box_map.joined(derived), header=header.model_copy(update=update))
+    }
+    return replace(box_map.joined(derived), header=header.model_copy(update=changes))

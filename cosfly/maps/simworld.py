@@ -25,6 +25,7 @@ from cosfly.maps.boxlist import (
     BoxList,
     MapLicence,
     MapName,
+    Pair,
     SkippedEntries,
     required,
 )
@@ -152,44 +153,46 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
     has_surfaces = any(node.instance_name == SURFACE_NODE for node in nodes)
     stand_m = 0.0 if has_surfaces else STAND_M
     boxes = BoxList()
-    sources = {"road": 0, "bbox": 0, "engine": 0, "default": 0}
+    size_sources = {"road": 0, "bbox": 0, "engine": 0, "default": 0}
     dropped = SkippedEntries()
-    road_nodes: list[_Node] = []
+    roads: list[_Node] = []
     for node in nodes:
-        asset = asset_of(node.instance_name)
-        if asset is None and (kind := kind_of(node.instance_name)):  # `cosfly world` names nodes after kinds
-            asset = Asset(node.instance_name, kind)
+        asset = asset_of(node.instance_name) or _asset_of_kind(node.instance_name)
+        size_cm = sizes.get(node.instance_name)
         if asset is not None and asset.pattern == ROAD_PIECES:
-            road_nodes.append(node)
-            continue
-        size = sizes.get(node.instance_name)
-        if asset is None or size is None:
+            roads.append(node)
+        elif asset is None or size_cm is None:
             problem = f"the asset {node.instance_name} has no {'kind' if asset is None else 'size'}"
             dropped.add("unknown_asset", node.id, problem)
-            continue
-        sources[_add_node(boxes, node, asset, size, stand_m, world)] += 1
-    if has_surfaces and road_nodes:  # the world has its roads as surfaces
-        dropped.counts["road_piece"] = len(road_nodes)
+        else:
+            size_sources[_add_node(boxes, node, asset, size_cm, stand_m, world)] += 1
+    if has_surfaces and roads:  # the world has its roads as surfaces
+        dropped.counts["road_piece"] = len(roads)
     expected = (
         f"at most {cfg.most_skipped:.0%} of the objects without a kind or size (maps.simworld.most_skipped); sizes are "
         "in the tables of maps.simworld.sizes, kinds in cosfly/simulators/assets.yaml"
     )
     dropped.check(world, len(nodes), cfg.most_skipped, expected)
     widths: dict[str, float] = {}
-    num_asset_boxes = len(boxes)
+    num_of_world = len(boxes)
     if not has_surfaces:
-        widths = _add_roads(boxes, road_nodes)
-        sources["road"] = len(boxes) - num_asset_boxes
-        num_asset_boxes = len(boxes)
-        _add_ground_and_paint(boxes, road_nodes, widths)
+        widths = _add_roads(boxes, roads)
+        size_sources["road"] = len(boxes) - num_of_world
+        num_of_world = len(boxes)
+        _add_ground_and_paint(boxes, roads, widths)
     tool = "cosfly world" if has_surfaces else "SimWorld city generator"
     header = MapHeader(
         name=cfg.name, source=MapSource(tool=tool, version="world file", file=world.name), licence=cfg.licence,
-        credits=cfg.credits, ground_z_m=0.0, extent_sources=sources, roads=widths,
-        added_boxes=len(boxes) - num_asset_boxes, num_objects=len(nodes),
-        dropped_objects=dict(dropped.counts),
+        credits=cfg.credits, ground_z_m=0.0, extent_sources=size_sources, roads=widths,
+        added_boxes=len(boxes) - num_of_world, num_objects=len(nodes), dropped_objects=dict(dropped.counts),
     )  # fmt: skip
     return boxes.box_map(header)
+
+
+def _asset_of_kind(name: str) -> Asset | None:
+    """Return the asset of a node that `cosfly world` named after a kind, such as Water_C; else None."""
+    kind = kind_of(name)
+    return Asset(name, kind) if kind else None
 
 
 def read_sizes(paths: list[Path]) -> dict[str, np.ndarray]:
@@ -243,25 +246,40 @@ def _add_roads(boxes: BoxList, roads: list[_Node]) -> dict[str, float]:
     if not roads:
         return {}
     kerb, front = _half_widths(boxes, roads)
-    bands = (-front, -kerb), (-kerb, kerb), (kerb, front)  # across a road: pavement, carriageway, pavement
-    junctions: dict[tuple[int, int], list[np.ndarray]] = {}
+    junctions: dict[tuple[int, int], list[np.ndarray]] = {}  # place -> directions of its roads
     for node in roads:
         for end, away in zip(node.ends, (node.direction, -node.direction), strict=True):
             junctions.setdefault(tuple(np.round(end).astype(int)), []).append(away)
-        road = boxes.framed(node.ends[0], float(np.degrees(np.arctan2(*node.direction[::-1]))))
-        for band in (1, 0, 2) if 2 * front < ROAD_LENGTH_M else ():  # junctions reach as far as the fronts
-            low, high = bands[band]
-            road.lay("Roads" if band == 1 else "Sidewalks", (front, low), (ROAD_LENGTH_M - front, high))
-    for place, arms in junctions.items():  # pavement at the four corners, and across the sides without a road
-        x = arms[0]
-        y = np.array([-x[1], x[0]])
-        junction = boxes.framed(place, float(np.degrees(np.arctan2(x[1], x[0]))))
-        for a, b in ((1, 1), (0, 0), (0, 2), (2, 0), (2, 2), (2, 1), (0, 1), (1, 2), (1, 0)):
-            away = (a - 1) * x + (b - 1) * y
-            is_road = a == b == 1 or (1 in (a, b) and any(arm @ away > 0.7 for arm in arms))
-            first, last = zip(bands[a], bands[b], strict=True)
-            junction.lay("Roads" if is_road else "Sidewalks", first, last)
+        if 2 * front < ROAD_LENGTH_M:  # junctions reach as far as the fronts
+            road = boxes.framed(node.ends[0], _yaw_deg(node.direction))
+            end_m = ROAD_LENGTH_M - front
+            road.lay("Roads", (front, -kerb), (end_m, kerb))
+            road.lay("Sidewalks", (front, -front), (end_m, -kerb))
+            road.lay("Sidewalks", (front, kerb), (end_m, front))
+    for place, arms in junctions.items():
+        _add_junction(boxes, place, arms, kerb, front)
     return {"carriageway_m": 2 * kerb, "front_to_front_m": 2 * front}
+
+
+def _add_junction(boxes: BoxList, place: Pair, arms: list[np.ndarray], kerb: float, front: float) -> None:
+    """Add the nine fields of a junction: carriageway in the middle and towards its arms, pavement in the others.
+
+    arms: directions of its roads, (2,) each; the fields are aligned with the first.
+    """
+    x = arms[0]
+    y = np.array([-x[1], x[0]])
+    junction = boxes.framed(place, _yaw_deg(x))
+    bands = {-1: (-front, -kerb), 0: (-kerb, kerb), 1: (kerb, front)}
+    for column, row in ((0, 0), (-1, -1), (-1, 1), (1, -1), (1, 1), (1, 0), (-1, 0), (0, 1), (0, -1)):
+        away = column * x + row * y
+        is_corner = column != 0 and row != 0
+        is_road = column == row == 0 or (not is_corner and any(arm @ away > 0.7 for arm in arms))
+        low, high = zip(bands[column], bands[row], strict=True)
+        junction.lay("Roads" if is_road else "Sidewalks", low, high)
+
+
+def _yaw_deg(direction: np.ndarray) -> float:
+    return float(np.degrees(np.arctan2(direction[1], direction[0])))
 
 
 def _add_ground_and_paint(boxes: BoxList, roads: list[_Node], widths: dict) -> None:
@@ -269,7 +287,7 @@ def _add_ground_and_paint(boxes: BoxList, roads: list[_Node], widths: dict) -> N
     low, high = boxes.box_map().bounds()
     boxes.span("Terrain", low[:2] - MAP_MARGIN_M, high[:2] + MAP_MARGIN_M, BASE_TOP_M - SLAB_M, BASE_TOP_M)
     for node in roads:
-        road = boxes.framed(node.ends[0], float(np.degrees(np.arctan2(*node.direction[::-1]))))
+        road = boxes.framed(node.ends[0], _yaw_deg(node.direction))
         for start_m in np.arange(widths["carriageway_m"], ROAD_LENGTH_M - widths["carriageway_m"], DASH_STEP_M):
-            middle, size = (start_m + DASH_M / 2, 0.0), (DASH_M, DASH_WIDTH_M)
-            road.add("RoadLines", middle, size, ROAD_TOP_M - 0.04, PAINT_TOP_M)
+            middle = (start_m + DASH_M / 2, 0.0)
+            road.add("RoadLines", middle, (DASH_M, DASH_WIDTH_M), ROAD_TOP_M - 0.04, PAINT_TOP_M)

@@ -54,8 +54,8 @@ class MapsConfig(Config):
 
     def recorded(self) -> dict[str, Any]:
         """Return the settings that count for resumption: those of the chosen source, not of the others."""
-        others = SOURCES.keys() - {self.source}
-        return {name: value for name, value in super().recorded().items() if name not in others}
+        other_sources = SOURCES.keys() - {self.source}
+        return {name: value for name, value in super().recorded().items() if name not in other_sources}
 
 
 def load_map(cfg: MapsConfig, *, seed: int = 0, follow_links: bool = False) -> BoxMap:
@@ -63,8 +63,9 @@ def load_map(cfg: MapsConfig, *, seed: int = 0, follow_links: bool = False) -> B
 
     follow_links: also read meshes through links that lead out of the map's folder.
     """
-    box_map = SOURCES[cfg.source](getattr(cfg, cfg.source), seed)
-    check_not_empty(box_map, ", ".join(map(str, getattr(cfg, cfg.source).inputs().values())) or cfg.source)
+    settings = getattr(cfg, cfg.source)
+    box_map = SOURCES[cfg.source](settings, seed)
+    check_not_empty(box_map, ", ".join(map(str, settings.inputs().values())) or cfg.source)
     if not follow_links or box_map.meshes.folder is None:
         return box_map
     return replace(box_map, meshes=replace(box_map.meshes, folder=LinkedPath(box_map.meshes.folder)))
@@ -80,12 +81,16 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, follow_links: bool = False
     box_map = load_map(cfg, seed=seed, follow_links=follow_links)
     check_ground(box_map, next(iter(inputs.values()), product))
     write_boxes(product, box_map)
-    outputs = [product, out / "map.png"] + [out / MESHES_FILE] * bool(box_map.meshes.refs)
+    outputs = [product, out / "map.png"]
+    if box_map.meshes.refs:
+        outputs.append(out / MESHES_FILE)
     if cfg.source == "unrealcv":
         outputs += unrealcv_export.write_objects(box_map, out)
     write_bytes(out / "map.png", png_bytes(draw_map(box_map, TopView.around(np.stack(box_map.bounds()), PICTURE_PX))))
     dropped = box_map.header.dropped_objects
-    num_objects = len(box_map) if box_map.header.num_objects is None else box_map.header.num_objects
+    num_objects = box_map.header.num_objects
+    if num_objects is None:
+        num_objects = len(box_map)
     tally = Tally(input=num_objects, kept=num_objects - sum(dropped.values()), dropped=dropped)
     log.info("the map has %d boxes of %d objects", len(box_map), num_objects)
     stage.finish(outputs, tally, num_boxes=len(box_map), counts_by_kind=box_map.counts())

@@ -103,11 +103,11 @@ class SyntheticConfig(Config):
 
 
 class Strip(NamedTuple):
-    """The cross-section of one street: from house front to house front, and the carriageway inside; m, world frame."""
+    """The cross-section of one street, coordinates in m across it, world frame."""
 
-    low_m: float
+    low_m: float  # house fronts
     high_m: float
-    road: Range  # both kerbs
+    road: Range  # both kerbs of the carriageway
 
     @property
     def middle_m(self) -> float:
@@ -116,14 +116,11 @@ class Strip(NamedTuple):
 
 @dataclass(frozen=True)
 class Streets:
-    """All streets of a town, from low to high coordinates.
+    """All streets of a town, from low to high coordinates."""
 
-    rows: the streets along x. columns: the streets along y. river: the row that is water, if there is one.
-    """
-
-    rows: list[Strip]
-    columns: list[Strip]
-    river: Strip | None
+    rows: list[Strip]  # along x
+    columns: list[Strip]  # along y
+    river: Strip | None  # the row that is water, if there is one
 
     def along(self, axis: int) -> list[Strip]:
         """Return the streets along x (0) or y (1)."""
@@ -136,9 +133,9 @@ class Streets:
     def blocks(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the low and the high corner of each block, row by row."""
         return [
-            (np.array([a.high_m, c.high_m]), np.array([b.low_m, d.low_m]))
-            for c, d in pairwise(self.rows)
-            for a, b in pairwise(self.columns)
+            (np.array([west.high_m, south.high_m]), np.array([east.low_m, north.low_m]))
+            for south, north in pairwise(self.rows)
+            for west, east in pairwise(self.columns)
         ]
 
 
@@ -166,16 +163,18 @@ def build_town(plan: TownPlan, name: str, seed: int) -> BoxMap:
     _add_surfaces(town, streets)
     for axis in (0, 1):
         for strip in streets.along(axis):
-            for stretch in streets.stretches(axis) if strip is not streets.river else []:
-                add_road_paint(town, axis, stretch, strip.road)
+            if strip is not streets.river:
+                for stretch in streets.stretches(axis):
+                    add_road_paint(town, axis, stretch, strip.road)
     for axis in (0, 1):
-        for number, strip in enumerate(streets.along(axis)):
-            plot = plot_of(*corners, f"street {axis} {number}")
-            is_wide, parked_share = strip.high_m - strip.low_m >= WIDE_M, plan.parked_share
+        for index, strip in enumerate(streets.along(axis)):
+            plot = plot_of(*corners, f"street {axis} {index}")
+            is_wide = strip.high_m - strip.low_m >= WIDE_M
+            parked_share = 0.0 if strip is streets.river else plan.parked_share
             for stretch in streets.stretches(axis):
                 furnish(
                     plot, axis, stretch, strip.road, is_wide=is_wide, tree_share=plan.tree_share,
-                    parked_share=parked_share if strip is not streets.river else 0.0,
+                    parked_share=parked_share,
                 )  # fmt: skip
     _add_traffic_lights(town, streets)
     _add_sewers(town, streets)
@@ -183,8 +182,8 @@ def build_town(plan: TownPlan, name: str, seed: int) -> BoxMap:
     if streets.river is not None:
         _add_river(town, plan, streets, streets.river)
     kinds = _block_kinds(plan, rng_for(seed, "maps", "plan"))
-    for number, (kind, block) in enumerate(zip(kinds, streets.blocks(), strict=True)):
-        row, column = divmod(number, plan.num_blocks)
+    for index, (kind, block) in enumerate(zip(kinds, streets.blocks(), strict=True)):
+        row, column = divmod(index, plan.num_blocks)
         BLOCKS[kind](plot_of(*block, f"block {row} {column}"))
     source = MapSource(tool="cosfly maps synthetic", version=GENERATOR_VERSION, seed=seed)
     return boxes.box_map(MapHeader(name=name, source=source, licence=OUR_LICENCE, ground_z_m=0.0))
@@ -237,7 +236,7 @@ def _add_river(town: Plot, plan: TownPlan, streets: Streets, river: Strip) -> No
     low, high = river.road
     bridge_edges = [m for strip in streets.columns for m in (strip.low_m, strip.high_m)]
     edges = [-plan.size_m / 2, *bridge_edges, plan.size_m / 2]
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
+    for start, end in zip(edges[::2], edges[1::2], strict=True):  # between the bridges
         town.span("Water", (start, low), (end, high), WATER_BOTTOM_M, WATER_TOP_M)
         for quay in (low, high):
             town.span("Walls", (start, quay - RAILING_M), (end, quay + RAILING_M), WATER_BOTTOM_M, 0.5)
@@ -271,19 +270,23 @@ def _add_sewers(town: Plot, streets: Streets) -> None:
 
 def _add_verge(town: Plot, streets: Streets) -> None:
     """Add lawn, trees and a fence with gates around the town, but not in a river."""
-    rng, river = town.rng, streets.river
+    rng = town.rng
+    river = streets.river
     half = town.high[0]
     edge = streets.columns[-1].high_m
     town.ring("Terrain", (town.low, town.high), ((-edge,) * 2, (edge,) * 2))
+
+    def is_in_river(axis: int, along: float, margin_m: float) -> bool:
+        return axis == 1 and river is not None and river.low_m - margin_m < along < river.high_m + margin_m
+
     for side in (-1, 1):
         for axis in (0, 1):
             for start in np.arange(-half + 2.0, half - 12.0, 14.0):  # 12 m panels, 2 m gates
-                if river is None or axis == 0 or not river.low_m < start + 6.0 < river.high_m:
+                if not is_in_river(axis, start + 6.0, 0.0):
                     place = point(axis, start + 6.0, side * (half - 0.4))
                     town.add("Fences", place, point(axis, 12.0, 0.1), -0.1, 1.3)
             for start in np.arange(-half + 8.0, half - 6.0, 11.0):
-                in_river = river is not None and axis == 1 and river.low_m - 6.0 < start < river.high_m + 6.0
-                if rng.random() < 0.75 and not in_river:
+                if rng.random() < 0.75 and not is_in_river(axis, start, 6.0):
                     along = start + rng.uniform(-2, 2)
                     place = point(axis, along, side * (half - 0.45 * VERGE_M + rng.uniform(-0.8, 0.8)))
                     town.tree(place, (3.5, 5.5), (6.0, 12.0))
@@ -296,13 +299,18 @@ def _block_kinds(plan: TownPlan, rng: np.random.Generator) -> list[str]:
     the built kinds in turn.
     """
     count = plan.num_blocks * plan.num_blocks
+    kinds: list[str] = []
     if plan.blocks:
         exact = {name: share / sum(plan.blocks.values()) * count for name, share in plan.blocks.items()}
-        kinds = [name for name, value in exact.items() for _ in range(int(value))]
+        for name, value in exact.items():
+            kinds += [name] * int(value)
         kinds += sorted(exact, key=lambda name: int(exact[name]) - exact[name])[: count - len(kinds)]
     else:
         num_open = max(1, count // 9)
-        kinds = ["park"] * (num_open if count > 1 else 0) + ["square"] * (num_open if count > 3 else 0)
+        if count > 1:
+            kinds += ["park"] * num_open
+        if count > 3:
+            kinds += ["square"] * num_open
         kinds += [("courtyard", "houses", "towers")[i % 3] for i in range(count - len(kinds))]
     kinds = [kinds[i] for i in rng.permutation(count)]
     if plan.center in kinds:

@@ -27,8 +27,10 @@ def point(axis: int, along: float, across: float) -> tuple[float, float]:
 
 
 class Plot(BoxList):
-    """A rectangle of the town, from its low to its high corner, (2,) m. It adds boxes to the town's list and has a
-    random generator of its own."""
+    """A rectangle of the town, from its low to its high corner, (2,) m, with its own random generator.
+
+    Its boxes are added to the town's list.
+    """
 
     def __init__(self, town: BoxList, low: Pair, high: Pair, rng: np.random.Generator) -> None:
         super().__init__(town.rows, town.kinds, frame=town.frame)
@@ -75,7 +77,7 @@ class Plot(BoxList):
         x, y = position
         crown = rng.uniform(*crowns_m)
         height = rng.uniform(*heights_m)
-        has_parts = rng.random() < parts if 0 < parts < 1 else bool(parts)
+        has_parts = parts == 1.0 or (parts > 0.0 and rng.random() < parts)
         if not has_parts:
             self.add("Vegetation", position, (crown, crown * rng.uniform(0.9, 1.1)), 0.0, height)
             return
@@ -104,16 +106,18 @@ def add_road_paint(
     plot: Plot, axis: int, stretch: Range, kerbs: Range, crossings: tuple[bool, bool] = (True, True)
 ) -> None:
     """Add centre dashes, and zebra crossings at the low and the high end of a stretch of street."""
-    low, high = stretch
-    middle = (kerbs[0] + kerbs[1]) / 2
-    dashes = np.arange(low + 7.0, high - 7.0 - DASH_M, DASH_M + DASH_GAP_M) + DASH_M / 2
-    stripes = np.arange(kerbs[0] + 0.7, kerbs[1] - 0.5, 1.2)
-    ends = [end for end, is_crossing in zip((low + 2.5, high - 2.5), crossings, strict=True) if is_crossing]
-    paint = [(at, middle, DASH_M, 0.16) for at in dashes]
-    paint += [(end, across, 3.0, 0.55) for end in ends for across in stripes]
-    for along, across, length_m, width_m in paint:
+
+    def paint(along: float, across: float, length_m: float, width_m: float) -> None:
         size = point(axis, length_m, width_m)
         plot.add("RoadLines", point(axis, along, across), size, ROAD_TOP_M - 0.04, PAINT_TOP_M)
+
+    low, high = stretch
+    for start in np.arange(low + 7.0, high - 7.0 - DASH_M, DASH_M + DASH_GAP_M):
+        paint(start + DASH_M / 2, (kerbs[0] + kerbs[1]) / 2, DASH_M, 0.16)
+    for end, has_crossing in zip((low + 2.5, high - 2.5), crossings, strict=True):
+        if has_crossing:
+            for across in np.arange(kerbs[0] + 0.7, kerbs[1] - 0.5, 1.2):
+                paint(end, across, 3.0, 0.55)
 
 
 def furnish(
@@ -138,13 +142,13 @@ def _add_lamps_and_trees(
     rng = plot.rng
     low, high = stretch
     across = kerb + side * LAMP_FROM_KERB_M
-    for number, along in enumerate(np.arange(low + LAMPS_START_M, high - LAMPS_END_M, LAMP_SPACING_M)):
+    for index, along in enumerate(np.arange(low + LAMPS_START_M, high - LAMPS_END_M, LAMP_SPACING_M)):
         place = point(axis, along, across)
-        if number % 3 == 0:
+        if index % 3 == 0:
             plot.add("Poles", place, (0.2, 0.2), 0.0, 7.6)
             arm = point(axis, along, across - side * 0.9)  # over the carriageway
             plot.add("Poles", arm, point(axis, 0.16, 2.0), 7.45, 7.6)
-        elif (is_wide or number % 3 == 1) and rng.random() < tree_share:
+        elif (is_wide or index % 3 == 1) and rng.random() < tree_share:
             crowns_m = (3.4, 4.6) if is_wide else (2.6, 3.4)
             plot.tree(place, crowns_m, (5.5, 9.5), 1.0 if is_wide else 0.0)
         elif rng.random() < 0.5:

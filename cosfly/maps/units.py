@@ -30,6 +30,10 @@ DEGREES = {4258, 4269, 4283, 4326, 4490, 4612, 4979, 6668, 7844}  # longitude an
 # The middle outline of a file is shorter than the first in degrees and longer than the second in metres.
 LARGEST_DEG, SMALLEST_M = 0.02, 0.3
 EARTH_M, EARTH_E2 = 6_378_137.0, 0.00669437999014  # WGS 84: equatorial radius, squared eccentricity
+_LENGTH = re.compile(
+    r"(?P<number>[-+]?\d*\.?\d+(?:[eE][-+]?\d+)?|[-+]?\d+\.)\s*(?P<unit>m|metres?|meters?|cm|ft|feet|foot|')?"
+    r"(?:\s*(?P<inches>\d+\.?\d*)\s*(?:\"|in))?"
+)
 
 
 def declared_units(declared: Any, where: str) -> Units | None:
@@ -42,8 +46,9 @@ def declared_units(declared: Any, where: str) -> Units | None:
         return None
     if re.search(r"CRS:?84|^wgs ?84$", text, re.IGNORECASE):
         return "degrees"
-    found = re.search(r"epsg\D*(?:[\d.]+[:/])?(\d{4,6})\b|^(\d{4,6})$", text, re.IGNORECASE)
-    code = int(found[1] or found[2]) if found else 0  # of a compound system: the horizontal one
+    # "urn:ogc:def:crs:EPSG::28992", ".../EPSG/0/7415" or "28992"; of a compound system the horizontal one.
+    match = re.search(r"epsg\D*(?:[\d.]+[:/])?(\d{4,6})\b|^(\d{4,6})$", text, re.IGNORECASE)
+    code = int(match[1] or match[2]) if match else 0
     if code in DEGREES:
         return "degrees"
     if any(first <= code <= last for first, last in METRIC):
@@ -65,10 +70,13 @@ def refused(declared: str, where: str) -> InputError:
 
 def _texts(declared: Any) -> list[str]:
     """Return the texts and codes in a declaration, whatever its form."""
-    if isinstance(declared, dict | list):
-        parts = declared if isinstance(declared, list) else [v for v in declared.values() if v not in ("name", "link")]
-        return [text for part in parts for text in _texts(part)]
-    return [] if declared is None else [str(declared) if isinstance(declared, str | int) else shown(declared)]
+    if isinstance(declared, dict):  # {"type": "name", "properties": {"name": ...}} of GeoJSON
+        declared = [value for value in declared.values() if value not in ("name", "link")]
+    if isinstance(declared, list):
+        return [text for part in declared for text in _texts(part)]
+    if declared is None:
+        return []
+    return [str(declared) if isinstance(declared, str | int) else shown(declared)]
 
 
 def seen_units(places: np.ndarray, sizes: np.ndarray) -> Units | None:
@@ -114,11 +122,9 @@ def length_m(value: Any) -> float:
     """Return a length in metres of a number or a text with a unit (`12`, `12 m`, `40'`, `39'4"`, `40 ft`), else NaN."""
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         return math.nan
-    match = re.fullmatch(
-        r"""([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?|[-+]?\d+\.)\s*(m|metres?|meters?|cm|ft|feet|foot|')?(?:\s*(\d+\.?\d*)\s*(?:"|in))?""",
-        str(value).strip(),
-    )
-    if match is None or (match[3] and match[2] not in ("'", "ft", "feet", "foot")):
+    match = _LENGTH.fullmatch(str(value).strip())
+    is_feet = match is not None and match["unit"] in ("'", "ft", "feet", "foot")
+    if match is None or (match["inches"] and not is_feet):
         return math.nan
-    factor = {"cm": 0.01, "ft": 0.3048, "feet": 0.3048, "foot": 0.3048, "'": 0.3048}.get(match[2], 1.0)
-    return float(match[1]) * factor + float(match[3] or 0.0) * 0.0254
+    unit_m = 0.01 if match["unit"] == "cm" else METRES["ft"] if is_feet else 1.0
+    return float(match["number"]) * unit_m + float(match["inches"] or 0.0) * 0.0254

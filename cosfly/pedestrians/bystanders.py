@@ -61,17 +61,27 @@ def bystanders_of(
     """Place the bystanders around one pedestrian trajectory."""
     bystanders: list[Bystander] = []
     placed_m = [target.positions_m[:, :2]]
-    for number in range(cfg.others):
-        for _ in range(cfg.num_retries + 1):
-            trip = _draw_trip(target, number, ground, cfg, rng)
-            positions_m = None if trip is None else avoid_collisions(*trip, np.stack(placed_m))
-            if positions_m is not None:
-                headings_rad = headings_of(positions_m, target.time_s)
-                on_ground_m = np.insert(positions_m, 2, ground.z_m, axis=1)
-                bystanders.append(Bystander(on_ground_m, headings_rad, is_look_alike=number < cfg.look_alikes))
-                placed_m.append(positions_m)
-                break
+    for index in range(cfg.others):
+        positions_m = _place(target, index, np.stack(placed_m), ground, cfg, rng)
+        if positions_m is not None:
+            headings_rad = headings_of(positions_m, target.time_s)
+            on_ground_m = np.insert(positions_m, 2, ground.z_m, axis=1)
+            bystanders.append(Bystander(on_ground_m, headings_rad, is_look_alike=index < cfg.look_alikes))
+            placed_m.append(positions_m)
     return Bystanders(target.path_id, bystanders)
+
+
+def _place(
+    target: PedestrianTrajectory, index: int, placed_m: np.ndarray, ground: WalkableGround, cfg: PedestriansConfig,
+    rng: np.random.Generator,
+) -> np.ndarray | None:  # fmt: skip
+    """Return the positions of a bystander, (n, 2) m, clear of people already placed; None after too many tries."""
+    for _ in range(cfg.num_retries + 1):
+        trip = _draw_trip(target, index, ground, cfg, rng)
+        positions_m = None if trip is None else avoid_collisions(*trip, placed_m)
+        if positions_m is not None:
+            return positions_m
+    return None
 
 
 def avoid_collisions(route: TimedRoute, time_s: np.ndarray, placed_m: np.ndarray) -> np.ndarray | None:
@@ -110,14 +120,15 @@ def gaps_m(positions_m: np.ndarray, placed_m: np.ndarray) -> np.ndarray:
 
 
 def _draw_trip(
-    target: PedestrianTrajectory, number: int, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator
+    target: PedestrianTrajectory, index: int, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator
 ) -> tuple[TimedRoute, np.ndarray] | None:
     """Draw a bystander's route that passes the target, back and forth for the duration; None if there is none.
 
-    Return it with its time, (n,) s, at each time of the target.
+    Return it with its time, (n,) s, at each time of the target. The route begins before the target's trajectory if the
+    pass would be too late otherwise.
     """
     duration_s = float(target.time_s[-1])
-    pass_time_s = number * GOLDEN % 1.0 * duration_s
+    pass_time_s = index * GOLDEN % 1.0 * duration_s
     target_cell = ground.grid.cells_at(target.positions_m[int(np.searchsorted(target.time_s, pass_time_s))])
     low_cells, high_cells = np.array(PASS_M) / cfg.resolution_m
     places = ground.sample_goals((int(target_cell[0]), int(target_cell[1])), low_cells, high_cells, rng)
@@ -136,8 +147,8 @@ def _draw_trip(
     step_s = float(target.time_s[1])
     times_s = pass_time_s + np.arange(0.0, duration_s, step_s)
     offsets_m = route.positions_at(route.sample(times_s)[0]) - ground.grid.centers_of(np.array(places[0]))
-    nearest = np.argmin(np.linalg.norm(offsets_m, axis=1))
-    return route, target.time_s + (float(times_s[nearest]) - pass_time_s)
+    nearest_s = float(times_s[np.argmin(np.linalg.norm(offsets_m, axis=1))])
+    return route, target.time_s + (nearest_s - pass_time_s)
 
 
 def _route_through(
@@ -149,8 +160,9 @@ def _route_through(
     if not ends:
         return None
     offsets = np.subtract(ends, place)
-    first, others = offsets[0], offsets[1:]
-    cosines = others @ first / np.linalg.norm(others, axis=1)  # of the angles to the first, times its length
+    candidates = offsets[1:]
+    # Cosines of the angles to the first end, times its distance.
+    cosines = candidates @ offsets[0] / np.linalg.norm(candidates, axis=1)
     leg_back = ground.route(place, ends[0])
     leg_ahead = ground.route(place, ends[1 + int(np.argmin(cosines))])
     return np.concatenate([leg_back[:0:-1], leg_ahead])

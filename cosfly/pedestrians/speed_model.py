@@ -39,15 +39,11 @@ def menger_curvature(polyline_m: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class TimedRoute:
-    """A polyline with a speed and a stop at each waypoint.
+    """A polyline with a speed and a stop at each waypoint; a piece is the segment between two neighbours."""
 
-    polyline_m: (k, 2) m, k at least 2, no two neighbours equal. limits_mps: (k,) speeds, except at stops. stops_s: (k,)
-    duration of the stop, 0 for none.
-    """
-
-    polyline_m: np.ndarray
-    limits_mps: np.ndarray
-    stops_s: np.ndarray
+    polyline_m: np.ndarray  # (k, 2) m, k at least 2, no two neighbours equal
+    limits_mps: np.ndarray  # (k,) speeds, except at stops
+    stops_s: np.ndarray  # (k,) duration of the stop, 0 for none
 
     @cached_property
     def along_m(self) -> np.ndarray:
@@ -61,7 +57,7 @@ class TimedRoute:
 
     @cached_property
     def times_s(self) -> np.ndarray:
-        """Return the times at waypoints without stops, (k,) s from 0.
+        """Return the times at which the waypoints would be reached if no stop took time, (k,) s from 0.
 
         A piece takes its length over the mean of its two speeds.
         """
@@ -110,17 +106,13 @@ def standing_time_s(time_s: np.ndarray, times_s: np.ndarray, stops_s: np.ndarray
 
 @dataclass(frozen=True)
 class Pace:
-    """One row of the table of paces; values are drawn uniformly from ranges.
+    """One row of the table of paces; values are drawn uniformly from ranges."""
 
-    hurries: cruises at `hurry_speed_mps`. stop_every_m: distance between stops. stop_s: duration of a stop. turn_at:
-    where the pedestrian turns back, as a share of the route. back: share of the route so far that is walked back.
-    """
-
-    hurries: bool = False
-    stop_every_m: tuple[float, float] | None = None
-    stop_s: tuple[float, float] = (0.0, 0.0)
-    turn_at: tuple[float, float] | None = None
-    back: tuple[float, float] = (0.0, 0.0)
+    hurries: bool = False  # cruises at `hurry_speed_mps`
+    stop_every_m: tuple[float, float] | None = None  # distance between stops
+    stop_s: tuple[float, float] = (0.0, 0.0)  # duration of a stop
+    turn_at: tuple[float, float] | None = None  # where the pedestrian turns back, as a share of the route
+    back: tuple[float, float] = (0.0, 0.0)  # share of the route so far that is walked back
 
 
 # Stops are long enough for a drone to come to rest, with a window of five frames before and after.
@@ -142,13 +134,13 @@ def take_pace(route_m: np.ndarray, pace: Pace, rng: np.random.Generator) -> tupl
     if len(route_m) < 3:
         return route_m, np.zeros(len(route_m))
     polyline_m = route_m
-    turn = len(route_m) - 1
+    stops_s = np.zeros(len(route_m))
     if pace.turn_at is not None:
-        turn = int(np.clip(round(rng.uniform(*pace.turn_at) * turn), 1, turn))
+        last = len(route_m) - 1
+        turn = int(np.clip(round(rng.uniform(*pace.turn_at) * last), 1, last))
         num_back = max(1, round(rng.uniform(*pace.back) * turn))
         polyline_m = np.concatenate([route_m[: turn + 1], route_m[turn - num_back : turn][::-1]])
-    stops_s = np.zeros(len(polyline_m))
-    if pace.turn_at is not None:
+        stops_s = np.zeros(len(polyline_m))
         stops_s[turn] = rng.uniform(*pace.stop_s)
     if pace.stop_every_m is not None:
         along_m = distances_along_m(polyline_m)

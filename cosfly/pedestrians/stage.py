@@ -7,7 +7,6 @@ straight segment behind it (0.92 instead of 1.07 m/s on the same 40 routes of a 
 
 import colorsys
 import logging
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +19,7 @@ from cosfly.formats.boxes import read_boxes
 from cosfly.formats.bystanders import BYSTANDERS_FILE, Bystanders, write_bystanders
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory, pace_field, paces_of, walk_id, write_paths
 from cosfly.formats.roi import read_roi
+from cosfly.geometry.trajectory_metrics import length_m
 from cosfly.pedestrians.astar import route_cost
 from cosfly.pedestrians.bystanders import bystanders_of
 from cosfly.pedestrians.speed_model import PACES, timed_route
@@ -27,6 +27,7 @@ from cosfly.pedestrians.walkable import (
     CROSSING,
     ROAD,
     PedestriansConfig,
+    StepSeconds,
     WalkableGround,
     count_on_road,
     timed,
@@ -47,32 +48,41 @@ STAGE = "pedestrians"
 REPORT_FORMAT = FileFormat("cosfly.pedestrians_report", "1.0")
 RETRY_REASONS = ("no_goal", "detour")
 
+# The overview picture: RGB of cells and of the outline of the region of interest.
+LONGER_SIDE_PX = 1600
+OBSTACLE, MARGIN, UNUSED, USED = (74, 76, 84), (158, 158, 164), (232, 228, 218), (190, 219, 238)
+ON_ROAD, ON_CROSSING, ROI_LINE = (203, 201, 214), (246, 226, 150), (226, 120, 20)
+CAPTION = "dark: obstacles, grey: margin, blue: walkable, violet: carriageway, yellow: crossings, orange: region"
+
 
 class PedestrianResult(NamedTuple):
-    """A trajectory with the pairs of ends rejected, by reason, and the seconds of the steps."""
+    """One trajectory."""
 
     trajectory: PedestrianTrajectory
-    retries: dict[str, int]
-    seconds: dict[str, float]
+    num_rejected: dict[str, int]  # pairs of ends, by RETRY_REASONS
+    seconds: dict[str, float]  # by step
 
 
 def make_pedestrian(
     path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, pace: str | None = None
 ) -> PedestrianResult:
     """Make one trajectory: draw its ends, find the route, apply a pace (None: drawn by its share), sample it."""
-    seconds = Counter[str]()
+    seconds = StepSeconds(float)
     pace_rng = rng.spawn(1)[0]  # a child takes no draw from its parent: shares of paces change no route
-    route_m, retries = _draw_route(path_id, ground, cfg, rng, seconds)
-    with timed(seconds, "report"):
+    route_m, num_rejected = _draw_route(path_id, ground, cfg, rng, seconds)
+    with timed(seconds, "report"):  # a name in manifests, which the following of the route shares with the report
         trajectory = follow_route(path_id, route_m, ground.z_m, cfg, rng, pace_rng, pace)
-    return PedestrianResult(trajectory, retries, dict(seconds))
+    return PedestrianResult(trajectory, num_rejected, dict(seconds))
 
 
 def follow_route(
     path_id: str, route_m: np.ndarray, ground_z_m: float, cfg: PedestriansConfig, rng: np.random.Generator,
     pace_rng: np.random.Generator, pace: str | None = None,
 ) -> PedestrianTrajectory:  # fmt: skip
-    """Return the trajectory along a route, (k, 2) m, at a pace; None: one that is drawn by its share."""
+    """Return the trajectory along a route, (k, 2) m, at a pace; None: one that is drawn by its share.
+
+    pace_rng draws the pace, its stops and turns; rng draws the speeds.
+    """
     name = pace or draw_by_share(cfg.pace, pace_rng)
     route = timed_route(route_m, PACES[name], cfg, rng, pace_rng)
     time_s, positions_m, speeds_mps = route.resample(cfg.dt_s)
@@ -81,27 +91,28 @@ def follow_route(
 
 
 def _draw_route(
-    path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, seconds: Counter[str]
+    path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, seconds: StepSeconds
 ) -> tuple[np.ndarray, dict[str, int]]:
     """Draw pairs of ends until one is accepted; return its route, (k, 2) m, and the rejected pairs by reason."""
     limits = cfg.min_distance_m / cfg.resolution_m, cfg.max_distance_m / cfg.resolution_m
-    retries = dict.fromkeys(RETRY_REASONS, 0)
+    rejected = dict.fromkeys(RETRY_REASONS, 0)
     for _ in range(cfg.num_retries + 1):
         with timed(seconds, "sample"):
             start = ground.sample_start(rng)
             goals = ground.sample_goals(start, *limits, rng)
         if not goals:
-            retries["no_goal"] += 1
+            rejected["no_goal"] += 1
             continue
         with timed(seconds, "astar"):
             cells = ground.route(start, goals[0])
         if route_cost(cells) > cfg.max_detour * np.hypot(*(cells[-1] - cells[0])):
-            retries["detour"] += 1
+            rejected["detour"] += 1
             continue
-        return ground.grid.centers_of(cells), retries
+        return ground.grid.centers_of(cells), rejected
     raise NoPathError(
         "no random pair of start and goal has a suitable route", where=path_id,
-        got=f"{cfg.num_retries + 1} tries: {retries['no_goal']} without a goal, {retries['detour']} with a long detour",
+        got=f"{cfg.num_retries + 1} tries: {rejected['no_goal']} without a goal, {rejected['detour']} with a long "
+        "detour",
         expected=f"a goal {cfg.min_distance_m:g} to {cfg.max_distance_m:g} m away, and a route without a long detour",
         fix="in the section pedestrians, lower min_distance_m or raise max_distance_m or num_retries",
     )  # fmt: skip
@@ -122,7 +133,7 @@ def make_worker(cfg: PedestriansConfig, seed: int, ground: WalkableGround) -> Wo
     def work(item: Item) -> Outcome:
         pedestrian = make_pedestrian(item.item_id, ground, cfg, rng_for(seed, STAGE, item.item_id), item.payload)
         trajectory = pedestrian.trajectory
-        record = {"path": trajectory.as_json(), "retries": pedestrian.retries, "seconds": pedestrian.seconds}
+        record = {"path": trajectory.as_json(), "retries": pedestrian.num_rejected, "seconds": pedestrian.seconds}
         if cfg.others:
             rng = rng_for(seed, STAGE, f"{item.item_id}/others")
             record["bystanders"] = bystanders_of(trajectory, ground, cfg, rng).as_json()
@@ -133,40 +144,56 @@ def make_worker(cfg: PedestriansConfig, seed: int, ground: WalkableGround) -> Wo
 
 def report(
     ground: WalkableGround, paths: list[PedestrianTrajectory], retries: list[dict[str, int]], failed: dict[str, int]
-) -> dict:
-    """Return `pedestrians_report.json`: equal inputs give equal bytes, so times are written to the manifest."""
-    rows: list[dict[str, Any]] = []
-    for path, rejected in zip(paths, retries, strict=True):
-        length_m = float(np.linalg.norm(np.diff(path.polyline_m, axis=0), axis=1).sum())
-        duration_s = float(path.time_s[-1])
-        on_road, on_crossings = count_on_road(path, ground.footing, ground.grid)
-        straight_m = float(np.linalg.norm(path.polyline_m[-1] - path.polyline_m[0]))
-        rows.append(
-            {"id": path.path_id, **pace_field(path.pace), "cells": len(path.polyline_m), "length_m": round(length_m, 3),
-             "straight_m": round(straight_m, 3), "points": len(path.time_s), "on_carriageway": on_road,
-             "on_crossings": on_crossings, "duration_s": duration_s,
-             "mean_speed_mps": round(length_m / duration_s, 4), "retries": rejected}
-        )  # fmt: skip
-    sums = {key: sum(row[key] for row in rows) for key in ("points", "on_carriageway", "on_crossings")}
-    total_m, total_s = (sum(row[key] for row in rows) for key in ("length_m", "duration_s"))
+) -> dict[str, Any]:
+    """Return `pedestrians_report.json`: equal inputs give equal bytes, so times are written to the manifest.
+
+    retries: the rejected pairs of ends of each path, by reason.
+    """
+    rows = [_report_row(ground, path, rejected) for path, rejected in zip(paths, retries, strict=True)]
+    sums = {
+        key: sum(row[key] for row in rows)
+        for key in ("cells", "points", "on_carriageway", "on_crossings", "length_m", "duration_s")
+    }
     total = {
-        "paths": len(rows), "cells": sum(row["cells"] for row in rows), **sums,
-        "on_carriageway_share": round(sums["on_carriageway"] / sums["points"], 4), "length_m": round(total_m, 3),
-        "duration_s": total_s, "mean_speed_mps": round(total_m / total_s, 4),
+        "paths": len(rows),
+        **{key: sums[key] for key in ("cells", "points", "on_carriageway", "on_crossings")},
+        "on_carriageway_share": round(sums["on_carriageway"] / sums["points"], 4),
+        "length_m": round(sums["length_m"], 3),
+        "duration_s": sums["duration_s"],
+        "mean_speed_mps": round(sums["length_m"] / sums["duration_s"], 4),
         "retries": {reason: sum(rejected[reason] for rejected in retries) for reason in RETRY_REASONS},
-    }  # fmt: skip
+    }
     return {**REPORT_FORMAT.header, "ground": ground.counts, "paths": rows, "failed": failed, "total": total}
+
+
+def _report_row(ground: WalkableGround, path: PedestrianTrajectory, rejected: dict[str, int]) -> dict[str, Any]:
+    path_m = length_m(path.polyline_m)
+    duration_s = float(path.time_s[-1])
+    on_road, on_crossings = count_on_road(path, ground.footing, ground.grid)
+    return {
+        "id": path.path_id,
+        **pace_field(path.pace),
+        "cells": len(path.polyline_m),
+        "length_m": round(path_m, 3),
+        "straight_m": round(float(np.linalg.norm(path.polyline_m[-1] - path.polyline_m[0])), 3),
+        "points": len(path.time_s),
+        "on_carriageway": on_road,
+        "on_crossings": on_crossings,
+        "duration_s": duration_s,
+        "mean_speed_mps": round(path_m / duration_s, 4),
+        "retries": rejected,
+    }
 
 
 def _write_bystanders(path: Path, records: list[dict], header: dict, cfg: PedestriansConfig) -> dict[str, int]:
     """Write `others.json`; return how many bystanders were requested and placed; warn where some are missing."""
     items = [Bystanders.from_json(record, f"{path.parent}: items.jsonl") for record in records]
     write_bystanders(path, items, header)
-    wanted = cfg.others * len(items)
-    placed = sum(len(bystanders.others) for bystanders in items)
-    if placed < wanted:
-        log.warning("pedestrians: only %d of %d bystanders could be placed", placed, wanted)
-    return {"wanted": wanted, "placed": placed}
+    num_requested = cfg.others * len(items)
+    num_placed = sum(len(bystanders.others) for bystanders in items)
+    if num_placed < num_requested:
+        log.warning("pedestrians: only %d of %d bystanders could be placed", num_placed, num_requested)
+    return {"wanted": num_requested, "placed": num_placed}
 
 
 def run(
@@ -181,27 +208,27 @@ def run(
     product = out / "path.json"
     if stage.is_complete:
         return product
-    seconds = Counter[str]()
+    seconds = StepSeconds(float)
     with timed(seconds, "read"):
         box_map = read_boxes(simplified_map)
         region = read_roi(roi) if roi else None
     ground = walkable_ground(box_map, cfg, region, where=simplified_map, roi_where=roi or "", seconds=seconds)
     items = [Item(walk_id(k), pace) for k, pace in enumerate(paces_of(cfg.num_paths, cfg.pace, seed))]
     # Workers need the labels only; sending the rest takes time.
-    lean = replace(ground, inflated=ground.grid, is_in_roi=None)
-    finished = run_items(
-        stage, items, make_worker, (cfg, seed, lean), workers=workers, watch=watch, label="trajectories"
-    )
-    if not finished.tally.kept:
-        raise stage.nothing_kept(finished.tally)
-    results = [result_of(record, _PedestrianRecord) for record in finished.kept]
+    ground_of_workers = replace(ground, inflated=ground.grid, is_in_roi=None)
+    worker_args = (cfg, seed, ground_of_workers)
+    outcomes = run_items(stage, items, make_worker, worker_args, workers=workers, watch=watch, label="trajectories")
+    if not outcomes.tally.kept:
+        raise stage.nothing_kept(outcomes.tally)
+    results = [result_of(record, _PedestrianRecord) for record in outcomes.kept]
     paths = [PedestrianTrajectory.from_json(result.path, f"{out}: items.jsonl") for result in results]
     for result in results:
-        seconds.update(result.seconds)  # type: ignore[arg-type]
+        for step, duration_s in result.seconds.items():
+            seconds[step] += duration_s
     outputs = [product, out / "pedestrians_report.json", out / "paths.png"]
     with timed(seconds, "report"):
         retries = [result.retries for result in results]
-        summary = report(ground, paths, retries, dict(sorted(finished.tally.failed.items())))
+        summary = report(ground, paths, retries, dict(sorted(outcomes.tally.failed.items())))
         write_paths(product, paths, {"map": box_map.name, "seed": seed, "settings": cfg.all_values()})
         if cfg.others:
             header = {"map": box_map.name, "seed": seed, "dt_s": cfg.dt_s}
@@ -214,15 +241,11 @@ def run(
             log.info(words + "pedestrians.road_cost=20 prefers pavements", 100 * share)
         write_bytes(out / "paths.png", draw_overview(ground, paths))
     rounded = {step: round(value, 4) for step, value in seconds.items()}
-    stage.finish(outputs, finished.tally, ground=ground.counts, total=summary["total"], seconds_by_step=rounded)
+    stage.finish(outputs, outcomes.tally, ground=ground.counts, total=summary["total"], seconds_by_step=rounded)
     return product
 
 
-LONGER_SIDE_PX = 1600
-# RGB of cells and of the outline of the region of interest
-OBSTACLE, MARGIN, UNUSED, USED = (74, 76, 84), (158, 158, 164), (232, 228, 218), (190, 219, 238)
-ON_ROAD, ON_CROSSING, ROI_LINE = (203, 201, 214), (246, 226, 150), (226, 120, 20)
-CAPTION = "dark: obstacles, grey: margin, blue: walkable, violet: carriageway, yellow: crossings, orange: region"
+# --- the overview picture ---------------------------------------------------------------------------------------------
 
 
 def draw_overview(ground: WalkableGround, paths: list[PedestrianTrajectory]) -> bytes:
@@ -230,12 +253,12 @@ def draw_overview(ground: WalkableGround, paths: list[PedestrianTrajectory]) -> 
     grid = ground.grid
     num_x, num_y = grid.size
     colors = np.full((num_y, num_x, 3), UNUSED, dtype=np.uint8)
-    for mask, color in (
-        (ground.walkable, USED), (ground.walkable & (ground.footing >= ROAD), ON_ROAD),
-        (ground.walkable & (ground.footing == CROSSING), ON_CROSSING), (ground.inflated.occupied, MARGIN),
-        (grid.occupied, OBSTACLE),
-    ):  # fmt: skip
-        colors[mask] = color
+    # Later colours cover earlier ones.
+    colors[ground.walkable] = USED
+    colors[ground.walkable & (ground.footing >= ROAD)] = ON_ROAD
+    colors[ground.walkable & (ground.footing == CROSSING)] = ON_CROSSING
+    colors[ground.inflated.occupied] = MARGIN
+    colors[grid.occupied] = OBSTACLE
     scale = LONGER_SIDE_PX / max(num_x, num_y)
     width, height = max(1, round(num_x * scale)), max(1, round(num_y * scale))
     method = cv2.INTER_NEAREST if scale >= 1 else cv2.INTER_AREA
@@ -248,14 +271,18 @@ def draw_overview(ground: WalkableGround, paths: list[PedestrianTrajectory]) -> 
         outlines, _ = cv2.findContours(ground.is_in_roi.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
         for outline in outlines:
             draw_line(picture, view.pixels(ground.grid.centers_of(outline[:, 0])), ROI_LINE, thickness, closed=True)
-    for number, path in enumerate(paths):
-        # Neighbours are far apart on the colour circle (golden ratio).
-        hue_rgb = colorsys.hsv_to_rgb((0.02 + number * 0.618034) % 1.0, 0.85, (0.62, 0.85)[number % 2])
-        red, green, blue = (round(part * 255) for part in hue_rgb)
-        color = red, green, blue
+    for index, path in enumerate(paths):
+        color = _color_of(index)
         line = view.pixels(path.polyline_m)
         draw_line(picture, line, color, thickness)
         draw_dot(picture, line[0], 7, PAPER)
         draw_dot(picture, line[0], 7, color, thickness)
         draw_dot(picture, line[-1], 6, color)
     return png_bytes(add_caption(picture, f"{len(paths)} trajectories, a ring is a start; {CAPTION}"))
+
+
+def _color_of(index: int) -> tuple[int, int, int]:
+    """Return the colour of a trajectory; those of neighbours are far apart on the colour circle (golden ratio)."""
+    rgb = colorsys.hsv_to_rgb((0.02 + index * 0.618034) % 1.0, 0.85, (0.62, 0.85)[index % 2])
+    red, green, blue = (round(part * 255) for part in rgb)
+    return red, green, blue

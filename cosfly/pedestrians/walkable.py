@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -41,14 +41,17 @@ ROI_SHARE_MIN = 0.5  # of a region of interest that lies on the map; below, it b
 # Footings of cells. In a map that marks crossings, a crossing is carriageway under stripes: after gaps below GAP_M are
 # closed, its paint is MARKED_M wide in every direction, unlike dashes and edge lines. Where none is marked, the cost of
 # carriageway alone makes routes cross a street on the shortest way and not run along it.
-MARKED_M = GAP_M = 2.0
+GAP_M = 2.0
+MARKED_M = 2.0
 
 NUM_FOOTINGS = 4
 PAVED, OPEN, CROSSING, ROAD = range(NUM_FOOTINGS)  # those below CROSSING are off the carriageway
-OF_KIND = np.full(256, OPEN, dtype=np.uint8)
-OF_KIND[[KINDS["Sidewalks"], KINDS["Ground"]]] = PAVED
-OF_KIND[[KINDS["Roads"], KINDS["RailTrack"]]] = ROAD
+FOOTING_OF_KIND = np.full(256, OPEN, dtype=np.uint8)
+FOOTING_OF_KIND[[KINDS["Sidewalks"], KINDS["Ground"]]] = PAVED
+FOOTING_OF_KIND[[KINDS["Roads"], KINDS["RailTrack"]]] = ROAD
 PAINT = KINDS["RoadLines"]
+
+StepSeconds = defaultdict[str, float]  # duration of the steps of the stage
 
 
 class PedestriansConfig(Config):
@@ -114,21 +117,18 @@ class PedestriansConfig(Config):
 
 @dataclass(frozen=True)
 class WalkableGround:
-    """The walkable ground of a map.
+    """The walkable ground of a map."""
 
-    grid: The obstacles before inflation. inflated: After it. parts: (ny, nx) int32, one number for cells with a route
-    between them, 0 for cells that are not walkable: obstacles, outside the region of interest, small components.
-    footing: (ny, nx) uint8. z_m: Height of the ground. costs: Of footings, for routes.
-    """
-
-    grid: grids.OccupancyGrid
-    inflated: grids.OccupancyGrid
+    grid: grids.OccupancyGrid  # the obstacles before inflation
+    inflated: grids.OccupancyGrid  # the obstacles after inflation
+    # (ny, nx) int32, one number for cells with a route between them; 0 for cells that are not walkable: obstacles,
+    # outside the region of interest, small components.
     parts: np.ndarray
-    footing: np.ndarray
-    z_m: float
-    costs: np.ndarray
-    is_in_roi: np.ndarray | None = None
-    counts: dict[str, Any] = field(default_factory=dict)
+    footing: np.ndarray  # (ny, nx) uint8: PAVED, OPEN, CROSSING or ROAD
+    z_m: float  # height of the ground
+    costs: np.ndarray  # (NUM_FOOTINGS,) int64, of a step of a route on each footing
+    is_in_roi: np.ndarray | None = None  # (ny, nx) bool; None without a region of interest
+    counts: dict[str, Any] = field(default_factory=dict)  # as in `pedestrians_report.json`
 
     @cached_property
     def walkable(self) -> np.ndarray:
@@ -150,7 +150,8 @@ class WalkableGround:
         drawn = int(rng.integers(self.row_ends[-1]))  # in row-major order
         y = int(np.searchsorted(self.row_ends, drawn, side="right"))
         columns = np.flatnonzero(self.may_end[y])
-        return int(columns[len(columns) - (self.row_ends[y] - drawn)]), y
+        num_in_rows_above = self.row_ends[y] - len(columns)
+        return int(columns[drawn - num_in_rows_above]), y
 
     def sample_goals(
         self, start: tuple[int, int], min_cells: float, max_cells: float, rng: np.random.Generator, num: int = 1
@@ -163,15 +164,16 @@ class WalkableGround:
         reach = int(max_cells)
         first_x, first_y = max(0, x - reach), max(0, y - reach)
         near = np.s_[first_y : y + reach + 1, first_x : x + reach + 1]
-        window = self.parts[near]
-        rows, columns = np.arange(window.shape[0])[:, None], np.arange(window.shape[1])
+        num_rows, num_columns = self.parts[near].shape
+        rows, columns = np.arange(num_rows)[:, None], np.arange(num_columns)
         squared = (rows + first_y - y) ** 2 + (columns + first_x - x) ** 2
-        fits = (window == self.parts[y, x]) & self.may_end[near]
+        fits = (self.parts[near] == self.parts[y, x]) & self.may_end[near]
         candidates = np.flatnonzero(fits & (squared >= min_cells**2) & (squared <= max_cells**2))
-        if len(candidates) == 0:
-            return []
-        drawn = (divmod(int(candidates[rng.integers(len(candidates))]), window.shape[1]) for _ in range(num))
-        return [(column + first_x, row + first_y) for row, column in drawn]
+        goals = []
+        for _ in range(num if len(candidates) else 0):
+            row, column = divmod(int(candidates[rng.integers(len(candidates))]), num_columns)
+            goals.append((column + first_x, row + first_y))
+        return goals
 
     def route(self, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
         """Return the cells of a cheapest route between two cells of one part, (k, 2)."""
@@ -181,16 +183,16 @@ class WalkableGround:
 
 
 @contextmanager
-def timed(seconds: Counter[str], step: str) -> Iterator[None]:
+def timed(seconds: StepSeconds, step: str) -> Iterator[None]:
     """Add the time of a block to the seconds of a step."""
     start_s = time.perf_counter()
     yield
-    seconds[step] += time.perf_counter() - start_s  # type: ignore[assignment]
+    seconds[step] += time.perf_counter() - start_s
 
 
 def walkable_ground(
     box_map: BoxMap, cfg: PedestriansConfig, roi: Roi | None = None, *, where: str | Path = "map",
-    roi_where: str | Path = "region of interest", seconds: Counter[str] | None = None,
+    roi_where: str | Path = "region of interest", seconds: StepSeconds | None = None,
 ) -> WalkableGround:  # fmt: skip
     """Return the walkable ground of a map; `where` and `roi_where` are the files to name in an error.
 
@@ -198,7 +200,7 @@ def walkable_ground(
     cuts a corner cannot pass between two cells that touch at a corner only, so an 8-connected component may hold
     several parts; both ends of a route are drawn from one part, so that it exists.
     """
-    seconds = Counter() if seconds is None else seconds
+    seconds = StepSeconds(float) if seconds is None else seconds
     with timed(seconds, "grid"):
         empty = grids.empty_grid(box_map, cfg.resolution_m)
     with timed(seconds, "project"):
@@ -209,29 +211,33 @@ def walkable_ground(
     with timed(seconds, "inflate"):
         inflated = grids.inflate(grid, cfg.safety_radius_m)
         free = ~inflated.occupied
-        num_free = _count(free)
         has_surface = _surface(box_map, cfg.ground, grid, free)
+        walkable = free.copy()
         for mask in (has_surface, is_in_roi):
             if mask is not None:
-                free &= mask
+                walkable &= mask
     counts: dict[str, Any] = {
-        "boxes": len(box_map), "boxes_in_the_way": _count(grids.blocks_walking(box_map, height_m=cfg.human_height_m)),
-        "grid": list(grid.size), "cells": free.size, "cells_occupied": _count(grid.occupied),
-        "cells_inflated": free.size - num_free, "cells_free": num_free,
+        "boxes": len(box_map),
+        "boxes_in_the_way": _count(grids.blocks_walking(box_map, height_m=cfg.human_height_m)),
+        "grid": list(grid.size),
+        "cells": free.size,
+        "cells_occupied": _count(grid.occupied),
+        "cells_inflated": _count(inflated.occupied),
+        "cells_free": _count(free),
         "ground": cfg.ground if has_surface is not None else "anywhere",
         "cells_with_surface": None if has_surface is None else _count(has_surface),
         "cells_in_roi": None if is_in_roi is None else _count(is_in_roi),
-        "cells_walkable": _count(free),
-    }  # fmt: skip
+        "cells_walkable": _count(walkable),
+    }
     _check_walkable(counts, where, roi_where)
     with timed(seconds, "connectivity"):
-        parts, component_counts = _parts_of_large_components(free, cfg, where, where if roi is None else roi_where)
+        parts, component_counts = _parts_of_large_components(walkable, cfg, where, where if roi is None else roi_where)
     with timed(seconds, "footing"):
         costs = costs_of(cfg.road_cost)
         footing = footing_of(box_map, grid)
     counts |= component_counts
     ground = WalkableGround(grid, inflated, parts, footing, box_map.ground_z_m, costs, is_in_roi, counts)
-    if not ground.row_ends[-1]:
+    if not ground.may_end.any():
         raise NoPathError(
             "all walkable ground is road, but pedestrian trajectories must start and end off the road", where=where,
             got=f"{counts['cells_used']} walkable cells, all Roads",
@@ -265,12 +271,12 @@ def _surface(box_map: BoxMap, ground: str, grid: grids.OccupancyGrid, free: np.n
     if has_ground is None:
         log.warning("%s has no ground boxes: people walk wherever there is no obstacle", box_map.name)
         return None
-    paved = grids.surface(box_map, PAVED_KINDS, like=grid)
+    is_paved = grids.surface(box_map, PAVED_KINDS, like=grid)
     if ground == "paved":
-        return np.zeros_like(has_ground) if paved is None else paved
+        return np.zeros_like(has_ground) if is_paved is None else is_paved
     num_ground = _count(has_ground & free)
     num_free = _count(free)
-    if paved is None and num_ground < SURFACE_SHARE_MIN * num_free:
+    if is_paved is None and num_ground < SURFACE_SHARE_MIN * num_free:
         log.warning(
             "%s has no boxes of Roads, Sidewalks or Ground, and other ground under %d of %d free cells only: people "
             "walk wherever there is no obstacle", box_map.name, num_ground, num_free,
@@ -280,10 +286,10 @@ def _surface(box_map: BoxMap, ground: str, grid: grids.OccupancyGrid, free: np.n
 
 
 def _parts_of_large_components(
-    free: np.ndarray, cfg: PedestriansConfig, where: str | Path, error_where: str | Path
+    walkable: np.ndarray, cfg: PedestriansConfig, where: str | Path, error_where: str | Path
 ) -> tuple[np.ndarray, dict[str, Any]]:
     """Label the parts of the large components; return them and the counts of components; log the small ones."""
-    components, sizes = grids.connected_parts(free, 8)
+    components, sizes = grids.connected_parts(walkable, 8)
     is_large = sizes >= cfg.min_component_cells
     if not is_large.any():
         raise NoPathError(
@@ -294,13 +300,14 @@ def _parts_of_large_components(
         )  # fmt: skip
     parts, part_sizes = grids.connected_parts(is_large[components], 4)
     used = sorted(sizes[is_large].tolist(), reverse=True)
-    num_components, num_cells = len(sizes) - 1, sum(used)
-    if num_unused := _count(free) - num_cells:
+    num_components = len(sizes) - 1
+    num_unused = _count(walkable) - sum(used)
+    if num_unused:
         text = "%s: %d walkable cells in areas below pedestrians.min_component_cells=%d are not used (areas: %d)"
         log.info(text, where, num_unused, cfg.min_component_cells, num_components - len(used))
     return parts, {
         "components": num_components, "components_used": len(used), "component_sizes_used": used,
-        "cells_used": num_cells, "parts": len(part_sizes) - 1,
+        "cells_used": sum(used), "parts": len(part_sizes) - 1,
     }  # fmt: skip
 
 
@@ -311,13 +318,10 @@ def check_roi(roi: Roi, box_map: BoxMap, where: str | Path, *, refuse: bool = Fa
     region = roi.region()
     inside = shapely.intersection(region, shapely.box(*low[:2], *high[:2])).area / max(region.area, 1e-9)
     if refuse and inside < ROI_SHARE_MIN:
-        raise InputError(
-            "most of the region of interest lies outside the map",
-            where=where,
-            got=f"{inside:.0%} of the region on the map",
-            expected=f"at least {ROI_SHARE_MIN:.0%} on the map",
-            fix="draw the region on this map, in world metres: x is east, y is north",
-        )
+        what = "most of the region of interest lies outside the map"
+        expected = f"at least {ROI_SHARE_MIN:.0%} on the map"
+        fix = "draw the region on this map, in world metres: x is east, y is north"
+        raise InputError(what, where=where, got=f"{inside:.0%} of the region on the map", expected=expected, fix=fix)
     if 0.0 < inside < ROI_SHARE_MIN:
         log.warning("%s: %.0f %% of the region of interest lies outside the map", where, 100 * (1 - inside))
 
@@ -343,11 +347,12 @@ def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | 
 
 def footing_of(box_map: BoxMap, grid: grids.OccupancyGrid) -> np.ndarray:
     """Return the footing of each cell of a grid, by its topmost ground, (ny, nx) uint8."""
-    footing = OF_KIND[grids.surface_kinds(box_map, GROUND_KINDS - {PAINT}, like=grid)]
+    footing = FOOTING_OF_KIND[grids.surface_kinds(box_map, GROUND_KINDS - {PAINT}, like=grid)]
     is_road = footing == ROAD
     paint = grids.surface(box_map, {PAINT}, like=grid) if is_road.any() else None
     if paint is not None:
-        marked = _morphed(_morphed(paint, cv2.MORPH_CLOSE, GAP_M, grid), cv2.MORPH_OPEN, MARKED_M, grid)
+        closed = _morphed(paint, cv2.MORPH_CLOSE, GAP_M, grid)
+        marked = _morphed(closed, cv2.MORPH_OPEN, MARKED_M, grid)
         if (marked & is_road).any():
             reaches_kerb = _morphed(marked | (footing == PAVED), cv2.MORPH_CLOSE, GAP_M, grid)
             footing[reaches_kerb & is_road] = CROSSING

@@ -62,7 +62,7 @@ class CommandConfig(Config):
     )
 
     def opened(self, path: Path) -> Path:
-        """Return a path of a command as one whose links are followed, if the settings say so."""
+        """Return a path of a command; with `follow_links`, readers follow the links below it."""
         return LinkedPath(path) if self.follow_links else path
 
     @model_validator(mode="after")

@@ -133,12 +133,7 @@ def read_paper() -> Paper:
 def run(cfg: RunConfig, folder: Path, out: Path, *, pedestrians: int = 20, seed: int = 0, **pool: Any) -> Path:
     """Read a run directory; write `reproduction.html` and `reproduction.json`, and return the page."""
     done = [stage.name for stage in summarize(folder).stages if stage.state == "complete"]
-    if missing := [name for name in STAGES if name not in done]:
-        what, fix = "the run is not finished", f"finish it with cosfly run {folder}"
-        if cfg.towns:
-            what = "the run has several towns, and its directory itself has no drone trajectories"
-            fix = f"pass the directory of one town, such as {folder}/{next(iter(cfg.towns))}"
-        raise InputError(what, where=folder, got=f"no results of the stages {', '.join(missing)}", fix=fix)
+    _check_finished(cfg, folder, done)
     sample = measure(cfg, folder, out, pedestrians, done, pool | {"seed": seed})
     reader = FigureReader([folder, out], {} if sample is None else {"sample": sample})
     reader.derived |= derived_figures(cfg, folder, reader, done)
@@ -156,7 +151,19 @@ def run(cfg: RunConfig, folder: Path, out: Path, *, pedestrians: int = 20, seed:
     return _write_page(out, run_name(folder / "plan"), pedestrians, parts, left_out)
 
 
+def _check_finished(cfg: RunConfig, folder: Path, done: Sequence[str]) -> None:
+    missing = [name for name in STAGES if name not in done]
+    if missing:
+        what = "the run is not finished"
+        fix = f"finish it with cosfly run {folder}"
+        if cfg.towns:
+            what = "the run has several towns, and its directory itself has no drone trajectories"
+            fix = f"pass the directory of one town, such as {folder}/{next(iter(cfg.towns))}"
+        raise InputError(what, where=folder, got=f"no results of the stages {', '.join(missing)}", fix=fix)
+
+
 def _write_page(out: Path, name: str, pedestrians: int, parts: list[Part], left_out: dict[str, str]) -> Path:
+    """Write the page and the JSON file; return the page. left_out: what is not compared, and why."""
     facts = {
         "run": name,
         "made_by": f"cosfly {cosfly.__version__}, {num_cpus()} cores",
@@ -204,13 +211,9 @@ def our_figures(table: PaperTable, reader: FigureReader) -> tuple[dict[str, list
             continue
         named_rows = figures[0] or {}
         if not isinstance(named_rows, dict):
-            raise InputError(
-                "the field of the file is not a table of rows",
-                where=place,
-                got=json_type(named_rows),
-                expected="an object with one entry for each row name",
-                fix=MAKE_AGAIN,
-            )
+            what = "the field of the file is not a table of rows"
+            expected = "an object with one entry for each row name"
+            raise InputError(what, where=place, got=json_type(named_rows), expected=expected, fix=MAKE_AGAIN)
         rows |= {key: _as_list(row) for key, row in named_rows.items()}
     return rows, sources
 
@@ -329,27 +332,22 @@ class FigureReader:
             MissingFile: No root has the file.
             InputError: A function cannot be applied to the value.
         """
-        figures = list[Any]()
-        for query in place.split(" + "):
-            target, _, functions = query.partition("|")
-            file, _, keys = target.partition(":")
-            *parents, last = keys.split(".")
-            try:
-                values = [follow(self._document(file), [*parents, key]) for key in last.split(",")]
-                if functions:
-                    names = functions.split(",")
-                    values = [FUNCTIONS[name](value) if value else None for value in values for name in names]
-            except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
-                expected = f"a value for {functions}" if functions else "an object or a list where the key has `*`"
-                raise InputError(
-                    "the number for the comparison with the paper cannot be computed from this field",
-                    where=f"{file}: {keys}",
-                    got=str(error),
-                    expected=expected,
-                    fix=MAKE_AGAIN,
-                ) from None
-            figures += values
-        return figures
+        return [figure for query in place.split(" + ") for figure in self._figures_of_query(query)]
+
+    def _figures_of_query(self, query: str) -> list[Any]:
+        target, _, functions = query.partition("|")
+        file, _, keys = target.partition(":")
+        *parents, last = keys.split(".")
+        try:
+            values = [follow(self._document(file), [*parents, key]) for key in last.split(",")]
+            if not functions:
+                return values
+            names = functions.split(",")
+            return [FUNCTIONS[name](value) if value else None for value in values for name in names]
+        except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
+            expected = f"a value for {functions}" if functions else "an object or a list where the key has `*`"
+            what = "the number for the comparison with the paper cannot be computed from this field"
+            raise InputError(what, where=f"{file}: {keys}", got=str(error), expected=expected, fix=MAKE_AGAIN) from None
 
     def _document(self, file: str) -> Any:
         if file == DERIVED:
@@ -462,26 +460,29 @@ def rendering_figures(events: list[Event], manifest: Manifest) -> dict[str, list
 
     Frames are attempted if they are finished, or lost with a worker.
     """
-    workers = max((event.workers or 1 for event in events if event.event == "began"), default=1)
+    num_workers = max((event.workers or 1 for event in events if event.event == "began"), default=1)
     done = [event for event in events if event.event == "item_done"]
     lost = [event for event in events if event.event in LOSSES]
     probes = [event for event in events if event.event == "probe"]
-    attempted = sum(event.steps or 0 for event in [*done, *lost])
-    successful = sum(event.steps or 0 for event in done if event.status == "kept")
-    cores = round(float(np.mean([probe.cores_used or 0.0 for probe in probes] or [0.0])), 2)
-    peak_mib = max((sum((probe.rss_mib or {}).values()) for probe in probes), default=0.0)
-    restarts = sum(event.event == "restarted" for event in events)
-    return {
-        f"{workers} workers": [
-            manifest.seconds, attempted, successful, successful / manifest.seconds,
-            1.0 if successful else None,  # the speed-up against itself
-            cores, peak_mib, restarts, manifest.counts.failed.total(),
-        ]
-    }  # fmt: skip
+    num_attempted = sum(event.steps or 0 for event in [*done, *lost])
+    num_successful = sum(event.steps or 0 for event in done if event.status == "kept")
+    row = [
+        manifest.seconds,
+        num_attempted,
+        num_successful,
+        num_successful / manifest.seconds,
+        1.0 if num_successful else None,  # the speed-up against itself
+        round(float(np.mean([probe.cores_used or 0.0 for probe in probes] or [0.0])), 2),
+        max((sum((probe.rss_mib or {}).values()) for probe in probes), default=0.0),
+        sum(event.event == "restarted" for event in events),
+        manifest.counts.failed.total(),
+    ]
+    return {f"{num_workers} workers": row}
 
 
 def _caption_near(captions: Path, frame: str) -> dict[str, list[Any]] | None:
     """Return the accepted caption in both languages that is nearest to a frame, by field; None if there is none."""
+    # town/trajectory/variant/frames_playback/frame_00000
     *_, trajectory, _, _, name = frame.split("/")
     frame_index = int(name.rpartition("_")[2])
     accepted = [

@@ -3,7 +3,7 @@
 import contextlib
 import logging
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -132,34 +132,26 @@ def check(cfg: RunConfig) -> None:
     maps = [(name, town.maps.licence) for name, town in towns.items()] or [(cfg.maps.source, cfg.maps.licence)]
     choose_licence(cfg.release.licence, maps)
     for town in towns.values() or [cfg]:
-        if missing := ", ".join(sorted(set(cfg.release.modalities) - set(town.render.modalities))):
-            rendered = ", ".join(town.render.modalities)
-            raise ConfigError(
-                f"release.modalities contains {missing}, but the run does not render these pictures",
-                where="render.modalities",
-                got=rendered,
-                fix=f"add {missing} to render.modalities, or pass --set 'release.modalities=[{rendered}]'",
-            )
-        absent = ", ".join(sorted(set(cfg.release.tracks) - set(town.render.tracks)))
-        if cfg.release.pairs == "both" and absent:
-            rendered = ", ".join(town.render.tracks)
-            raise ConfigError(
-                f"release.tracks contains {absent}, but the run does not render these tracks",
-                where="render.tracks",
-                got=rendered,
-                fix=f"add {absent} to render.tracks, or pass --set 'release.tracks=[{rendered}]'",
-            )
+        _check_rendered("modalities", cfg.release.modalities, town.render.modalities, "pictures")
+        if cfg.release.pairs == "both":
+            _check_rendered("tracks", cfg.release.tracks, town.render.tracks, "tracks")
+
+
+def _check_rendered(setting: str, released: Collection[str], rendered: Collection[str], noun: str) -> None:
+    missing = ", ".join(sorted(set(released) - set(rendered)))
+    if missing:
+        got = ", ".join(rendered)
+        what = f"release.{setting} contains {missing}, but the run does not render these {noun}"
+        fix = f"add {missing} to render.{setting}, or pass --set 'release.{setting}=[{got}]'"
+        raise ConfigError(what, where=f"render.{setting}", got=got, fix=fix)
 
 
 def check_out(out: Path) -> None:
     """Refuse to make a run in the folder of a stage: its tree would hold a second one."""
     if (out / "stage.json").exists() and not (out / "run.yaml").exists():
-        raise ResumeError(
-            "the output directory contains the output of a single stage, not of a run",
-            where=out,
-            got="stage.json, but no run.yaml",
-            fix="choose another --out, such as the run directory above this folder",
-        )
+        what = "the output directory contains the output of a single stage, not of a run"
+        fix = "choose another --out, such as the run directory above this folder"
+        raise ResumeError(what, where=out, got="stage.json, but no run.yaml", fix=fix)
 
 
 def check_with_files(cfg: RunConfig) -> None:
@@ -180,7 +172,7 @@ def _run_town(cfg: RunConfig, out: Path, town_stages: list[Stage]) -> list[Stage
     """Run the stages of one town."""
     with _run_directory(cfg, out):
         results = [_run_stage(stage, out, f"{k}/{len(town_stages)}") for k, stage in enumerate(town_stages, 1)]
-        viewer = out / "viewer.html"  # written after the contact sheet
+        viewer = out / "viewer.html"  # written last: current if it is newer than all manifests
         finished_ns = [(out / stage.name / "manifest.json").stat().st_mtime_ns for stage in town_stages]
         is_shown = viewer.exists() and viewer.stat().st_mtime_ns > max(finished_ns)
         if (out / "render/manifest.json").exists() and not is_shown:

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -74,13 +74,10 @@ class RunSummary:
 def summarize(run: Path) -> RunSummary:
     """Return the summary of a run directory."""
     if not (run / "run.yaml").is_file():
-        raise InputError(
-            "the folder is not a run directory",
-            where=run,
-            got="no run.yaml in it",
-            expected="a directory that `cosfly run` wrote",
-            fix="pass the --out of a `cosfly run`",
-        )
+        what = "the folder is not a run directory"
+        expected = "a directory that `cosfly run` wrote"
+        fix = "pass the --out of a `cosfly run`"
+        raise InputError(what, where=run, got="no run.yaml in it", expected=expected, fix=fix)
     cfg = load(RunConfig, run / "run.yaml")
     names = list(STAGES)
     if cfg.towns:  # one release is made of all towns
@@ -107,15 +104,25 @@ def _stage(name: str, folder: Path) -> StageSummary:
 # Measured in `cosfly run showcase` (docs/benchmarks.md; 2 cores, AMD EPYC, idle): 3 pedestrians, 858 frames of
 # 0.9216 Mpx, 804 windows by `rules`. Rates of frames are per million pixels; their disk space is that of `quickstart`.
 BASIS = "`cosfly run showcase` on a 2-core machine (docs/benchmarks.md)"
-RATES = {  # stage: unit, seconds per unit, MB per unit
-    "maps": ("map", 0.2, 1.1),
-    "simplify": ("map", 1.4, 1.2),
-    "pedestrians": ("pedestrians", 4.6 / 3, 0.3 / 3),
-    "plan": ("pedestrians", 2.3 / 3, 0.4 / 3),
-    "render": ("frames", 51.2 / 790.7, 1.95),
-    "inspect": ("frames", 26.8 / 790.7, 0.7 / 790.7),
-    "caption": ("windows", 4.0 / 804, 7.4 / 804),
-    "release": ("frames", 25.4 / 790.7, 1.95),
+
+
+class Rate(NamedTuple):
+    """The time and disk space of a stage for each of its units."""
+
+    unit: str  # frames: of a million pixels
+    seconds: float
+    megabytes: float
+
+
+RATES = {
+    "maps": Rate("map", 0.2, 1.1),
+    "simplify": Rate("map", 1.4, 1.2),
+    "pedestrians": Rate("pedestrians", 4.6 / 3, 0.3 / 3),
+    "plan": Rate("pedestrians", 2.3 / 3, 0.4 / 3),
+    "render": Rate("frames", 51.2 / 790.7, 1.95),
+    "inspect": Rate("frames", 26.8 / 790.7, 0.7 / 790.7),
+    "caption": Rate("windows", 4.0 / 804, 7.4 / 804),
+    "release": Rate("frames", 25.4 / 790.7, 1.95),
 }
 START_S = 2.0  # of a stage and its workers, which `showcase` hides: inspect and release of `quickstart` take 2 to 4 s
 WALK_MPS = 1.0  # progress along the straight line from start to goal, with detours and stops
@@ -136,7 +143,7 @@ class StageEstimate:
     @property
     def amount(self) -> str:
         """The number of its units: `858 frames`."""
-        return f"{self.count:,} {RATES[self.name.rpartition('/')[2]][0]}"
+        return f"{self.count:,} {RATES[self.name.rpartition('/')[2]].unit}"
 
 
 def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
@@ -144,10 +151,12 @@ def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
     if not cfg.towns:
         frames = num_frames(cfg, out)
         return [*_estimates(cfg, out, frames), _release(cfg, out, [frames])]
-    rows, town_frames = list[StageEstimate](), list[list[int]]()
+    rows: list[StageEstimate] = []
+    town_frames: list[list[int]] = []
     for name, town in cfg.all_towns().items():
-        town_frames.append(num_frames(town, out / name))
-        rows += [replace(row, name=f"{name}/{row.name}") for row in _estimates(town, out / name, town_frames[-1])]
+        frames = num_frames(town, out / name)
+        town_frames.append(frames)
+        rows += [replace(row, name=f"{name}/{row.name}") for row in _estimates(town, out / name, frames)]
     return [*rows, _release(cfg, out, town_frames)]
 
 
@@ -175,7 +184,7 @@ def _estimates(cfg: RunConfig, out: Path, frames: list[int]) -> Iterator[StageEs
         "windows": sum(math.ceil(count / window.stride) for count in num_starts) * num_tracks,
     }
     for name in STAGES[:-1]:
-        yield _estimate(name, counts[RATES[name][0]], cfg, out)
+        yield _estimate(name, counts[RATES[name].unit], cfg, out)
 
 
 def _release(cfg: RunConfig, out: Path, town_frames: list[list[int]]) -> StageEstimate:
@@ -189,10 +198,13 @@ def _release(cfg: RunConfig, out: Path, town_frames: list[list[int]]) -> StageEs
 def _estimate(name: str, count: int, cfg: RunConfig, out: Path) -> StageEstimate:
     if _is_complete(out / name):
         return StageEstimate(name, count, 0.0, 0.0, True)
-    unit, unit_s, unit_mb = RATES[name]
-    scale = count * (cfg.render.width_px * cfg.render.height_px / 1e6 if unit == "frames" else 1)
+    rate = RATES[name]
+    num_units: float = count
+    if rate.unit == "frames":
+        num_units *= cfg.render.width_px * cfg.render.height_px / 1e6
     is_known = name != "caption" or cfg.caption.teacher_kind == "rules"
-    return StageEstimate(name, count, START_S + unit_s * scale if is_known else None, unit_mb * scale * 1e6, False)
+    seconds = START_S + rate.seconds * num_units if is_known else None
+    return StageEstimate(name, count, seconds, rate.megabytes * num_units * 1e6, False)
 
 
 def _is_complete(folder: Path) -> bool:
@@ -233,7 +245,7 @@ def small_targets(cfg: RunConfig) -> list[str]:
     plan, render = cfg.plan, cfg.render
     fov_deg = sum(render.fovs_deg) / len(render.fovs_deg)
     focal_px = render.width_px / 2.0 / math.tan(math.radians(fov_deg / 2.0))
-    small: dict[str, float] = {}
+    small: dict[str, float] = {}  # words -> share of the time
     for name, share in plan.styles.items():
         apart_m, up_m = plan.behind_distance_m, plan.altitude_preferred_m
         if name in ROWS:

@@ -85,13 +85,12 @@ class RunConfig(CommandConfig):
                 "the settings of a town cannot have a section `towns`", where=f"towns.{name}.towns", fix=fix
             )
         seed = int(rng_for(self.seed, "run", name).integers(2**31))
-        index = list(self.towns).index(name)
         shared = self.model_dump(mode="json", exclude={"towns", "maps"}) | {"name": name, "seed": seed}
         if self.render.weather_seed >= 0:  # otherwise the first trajectories of all towns have one sky
-            shared["render"]["weather_seed"] += index
-        changes_but_maps = {setting: value for setting, value in changes.items() if setting != "maps"}
+            shared["render"]["weather_seed"] += list(self.towns).index(name)
+        other_changes = {section: value for section, value in changes.items() if section != "maps"}
         maps = _named_maps(changes.get("maps", {}), name)
-        return build(RunConfig, _merged(self, shared, changes_but_maps) | {"maps": maps}, f"towns.{name}")
+        return build(RunConfig, _merged(self, shared, other_changes) | {"maps": maps}, f"towns.{name}")
 
 
 def _named_maps(maps: Any, town: str) -> Any:
@@ -151,11 +150,9 @@ def explain(cfg: BaseModel, section: str | None = None) -> list[Setting]:
         return settings
     selected = [s for s in settings if s.name == section or s.name.startswith(f"{section}.")]
     if not selected:
-        raise ConfigError(
-            f"there is no section or setting of this name{nearest(section, [setting.name for setting in settings])}",
-            got=section,
-            expected="a section such as plan, a setting such as plan.muco, or the file or name of a configuration",
-        )
+        what = f"there is no section or setting of this name{nearest(section, [setting.name for setting in settings])}"
+        expected = "a section such as plan, a setting such as plan.muco, or the file or name of a configuration"
+        raise ConfigError(what, got=section, expected=expected)
     return selected
 
 
@@ -169,9 +166,10 @@ def changed(cfg: BaseModel, section: str | None = None) -> list[Setting]:
 def _explain(
     group: Mapping[str, Any], models: Mapping[str, Any], values: Mapping[str, Any], above: str
 ) -> Iterator[Setting]:
+    """Yield the settings of a group. group: its schema. models: schemas by name. above: its name and a dot."""
     for name, field in group["properties"].items():
         meaning = field.get("description", "")
-        model = models.get(field.get("$ref", "").rpartition("/")[2], {})
+        model = _referenced(field, models)
         if "properties" in model:
             yield Setting(above + name, None, "", meaning)
             yield from _explain(model, models, values[name], f"{above}{name}.")
@@ -181,16 +179,25 @@ def _explain(
 
 def _kind_of(field: Mapping[str, Any], models: Mapping[str, Any]) -> str:
     """Return the allowed values in the words of JSON Schema: `number, exclusiveMinimum 0`, `string, enum a | b`."""
-    field = {**models.get(field.get("$ref", "").rpartition("/")[2], {}), **field}
-    kind = (
-        field.get("format") or field.get("type") or " or ".join(_kind_of(one, models) for one in field.get("anyOf", []))
-    )
+    field = {**_referenced(field, models), **field}
+    kind = field.get("format") or field.get("type")
+    if not kind:
+        kind = " or ".join(_kind_of(option, models) for option in field.get("anyOf", []))
     members = field.get("prefixItems") or [field.get("items") or field.get("additionalProperties")]
-    if of := [_kind_of(member, models) for member in members if isinstance(member, dict)]:
-        kind += f" of {', '.join(of)}"
-    limits = {name: field[name] for name in LIMITS if name in field}
-    words = (" | ".join(map(str, limit)) if isinstance(limit, list) else limit for limit in limits.values())
-    return ", ".join([kind or "any", *(f"{name} {word}" for name, word in zip(limits, words, strict=True))])
+    member_kinds = [_kind_of(member, models) for member in members if isinstance(member, dict)]
+    if member_kinds:
+        kind += f" of {', '.join(member_kinds)}"
+    words = [kind or "any"]
+    for name in LIMITS:
+        if name in field:
+            limit = field[name]
+            words.append(f"{name} {' | '.join(map(str, limit)) if isinstance(limit, list) else limit}")
+    return ", ".join(words)
+
+
+def _referenced(field: Mapping[str, Any], models: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the schema of the model that a field refers to; empty if it refers to none."""
+    return models.get(field.get("$ref", "").rpartition("/")[2], {})
 
 
 def nested(settings: list[Setting]) -> dict[str, Any]:

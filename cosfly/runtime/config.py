@@ -169,10 +169,19 @@ def load(model: type[C], path: Path | None, overrides: Iterable[str] = ()) -> C:
     """Return a model of the defaults, then the file, then the overrides."""
     overrides = list(overrides)
     data = apply_overrides(read_yaml(path) if path else {}, overrides)
-    return build(model, data, " with ".join([*([str(path)] if path else []), *(["--set"] if overrides else [])]))
+    return build(model, data, source_text(path, bool(overrides)))
+
+
+def source_text(path: Path | None, has_overrides: bool) -> str:
+    """Return the sources of settings for messages: `run.yaml with --set`."""
+    sources = [str(path)] if path else []
+    if has_overrides:
+        sources.append("--set")
+    return " with ".join(sources)
 
 
 def _problem(model: type[BaseModel], detail: Any) -> str:
+    """Return one error of pydantic in our words."""
     field = ".".join(str(part) for part in detail["loc"]) or "settings"
     kind = detail["type"]
     if kind == "extra_forbidden":
@@ -187,8 +196,9 @@ def _problem(model: type[BaseModel], detail: Any) -> str:
         return f"{field}: unknown setting{hint}"
     if kind in ("list_type", "tuple_type"):
         return f"{field}: the value is not a list, got {shown(detail['input'])}; write [{detail['input']}]"
+    message = "the value is not a group of settings" if kind == "model_type" else plain(detail["msg"])
     got = "" if isinstance(detail["input"], dict) else f", got {shown(detail['input'])}"
-    return f"{field}: {'the value is not a group of settings' if kind == 'model_type' else plain(detail['msg'])}{got}"
+    return f"{field}: {message}{got}"
 
 
 def _names(model: Any, above: str = "") -> Iterator[str]:
@@ -234,7 +244,6 @@ def config_file(config: Path | None) -> Path | None:
         got = "no run.yaml in it"
         raise ConfigError("this folder is not a run directory", where=config, got=got, expected=expected)
     if is_bare:
-        raise ConfigError(
-            f"there is no configuration of this name{nearest(str(config), names)}", where=config, expected=expected
-        )
+        what = f"there is no configuration of this name{nearest(str(config), names)}"
+        raise ConfigError(what, where=config, expected=expected)
     return config

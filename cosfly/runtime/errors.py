@@ -43,7 +43,11 @@ class CosflyError(Exception):
         fix: str | None = None,
     ) -> None:
         super().__init__(what)
-        self.what, self.where, self.got, self.expected, self.fix = what, where, got, expected, fix
+        self.what = what
+        self.where = where
+        self.got = got
+        self.expected = expected
+        self.fix = fix
 
     def __str__(self) -> str:
         got = self.got if self.got is None or isinstance(self.got, str) else shown(self.got)

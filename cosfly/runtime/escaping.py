@@ -14,12 +14,14 @@ _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u2
 _MARKDOWN = re.compile(r"([\\`*\[\]|~#]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9]))")  # within a word, _ means itself
 
 
-# What may be a key in an address: user and password, query, parameters, and a part of the path that names itself a key.
-# A slot of a caption is no address: `{change:distance@t2-t4}`.
 # All repetitions before a fixed character are bounded, so that the time is linear in the length of a foreign text.
+# An address, `https://host/path`, or a user with a password, `user:password@`. A slot of a caption is no address:
+# `{change:distance@t2-t4}`.
 _ADDRESS = re.compile(
     r"\b[A-Za-z][\w+.-]{0,30}://[^\s'\"<>]+|\b(?!(?<=\{)\w+:\w+@t\d)[\w.+-]{1,100}:[^\s@/'\"<>]{1,500}@(?=\w)"
 )
+# What may be a key in an address, and its replacement: user and password; query, parameters and fragment; and a part of
+# the path that names itself a key, such as `key=1234567` or `sk-1234567`.
 _KEYS = (
     (re.compile(r"(^|//)[^/]*(@|%40)"), r"\1***@"),
     (re.compile(r"(?i)([?;&]|%3f|%3b|%26|#(?=[^#]*=)).*"), "?***"),

@@ -32,17 +32,14 @@ Kind = Loss | Literal["began", "worker_started", "restarted", "item_done", "retr
 
 
 class Event(BaseModel):
-    """A line of `events.jsonl`; docs/files.md lists the fields of each kind and their units.
-
-    worker: Its index from 0; a replacement keeps it. rss_mib: By worker, the maximum since the last probe.
-    """
+    """A line of `events.jsonl`; docs/files.md lists the fields of each kind and their units."""
 
     model_config = ConfigDict(frozen=True)
 
     at_s: float
     event: Kind
     workers: int | None = None
-    worker: int | None = None
+    worker: int | None = None  # its index from 0; a replacement keeps it
     node: str | None = None
     pid: int | None = None
     item: str | None = None
@@ -50,7 +47,7 @@ class Event(BaseModel):
     seconds: float | None = None
     steps: int | None = None
     attempt: int | None = None
-    rss_mib: dict[int, float] | None = None
+    rss_mib: dict[int, float] | None = None  # by worker, the maximum since the last probe
     cores_used: float | None = None
     disk_free_mib: float | None = None
 
@@ -64,7 +61,8 @@ class Vitals(NamedTuple):
     @classmethod
     def of(cls, pid: int) -> Vitals:
         """Return the vitals of a process of this machine; zeros if it is gone or has no `/proc/PID/stat`."""
-        if not (fields := process_stat(pid)):
+        fields = process_stat(pid)
+        if not fields:
             return cls(0.0, 0.0)
         cpu_s = (int(fields[STAT_UTIME]) + int(fields[STAT_STIME])) / os.sysconf("SC_CLK_TCK")
         return cls(cpu_s, round(int(fields[STAT_RSS]) * os.sysconf("SC_PAGE_SIZE") / MEBIBYTE, 1))
@@ -76,7 +74,8 @@ class EventLog:
     def __init__(self, folder: Path) -> None:
         self._journal = Journal(folder / EVENTS)
         self._folder = folder
-        self._begun_s = self._probed_s = time.monotonic()
+        self._begun_s = time.monotonic()
+        self._probed_s = self._begun_s  # time of the last written probe
         self._peaks_mib: dict[int, float] = {}  # by worker, since the last written probe
         self._cpu_s: dict[int, float] = {}  # by worker, at the last measurement
         self._used_s = 0.0  # processor time of all workers since the last written probe

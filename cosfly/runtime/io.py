@@ -64,16 +64,18 @@ def open_file(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Pa
         check_stays_below(path, tree)
     try:
         # Without O_NONBLOCK, opening a named pipe without a writer would block forever.
-        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    except (OSError, ValueError) as error:  # ValueError: an invalid name
-        got = "a socket" if getattr(error, "errno", 0) == errno.ENXIO else getattr(error, "strerror", str(error))
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except ValueError as error:  # an invalid name
+        raise InputError(f"the {what} cannot be read", where=path, got=str(error), fix=fix) from None
+    except OSError as error:
+        got = "a socket" if error.errno == errno.ENXIO else error.strerror
         raise InputError(f"the {what} cannot be read", where=path, got=got, fix=fix) from None
-    mode = os.fstat(number).st_mode
+    mode = os.fstat(descriptor).st_mode
     if not stat.S_ISREG(mode):
-        os.close(number)
+        os.close(descriptor)
         got = {"d": "a folder", "p": "a named pipe"}.get(stat.filemode(mode)[0], "a device")
         raise InputError(f"the {what} cannot be read", where=path, got=got, expected="a regular file", fix=fix)
-    return os.fdopen(number, "rb")
+    return os.fdopen(descriptor, "rb")
 
 
 @contextlib.contextmanager
@@ -179,8 +181,9 @@ def files_named(tree: Path, name: str) -> list[Path]:
     """
     matches = list[Path]()
     root = os.path.realpath(tree)
-    waiting: list[tuple[Path, tuple[str, ...]]] = [(tree, (root,))]
     parent = os.path.dirname(root)
+    # Folders to search, each with the real paths of the tree and of the links above it.
+    waiting: list[tuple[Path, tuple[str, ...]]] = [(tree, (root,))]
     while waiting:
         folder, above = waiting.pop()
         with disk_errors(folder, "folder"), os.scandir(folder) as listed:
@@ -194,11 +197,8 @@ def files_named(tree: Path, name: str) -> list[Path]:
             elif entry.is_symlink() and os.path.isdir(entry.path):  # isdir is false for a link to itself
                 real = os.path.realpath(entry.path)
                 if not (isinstance(tree, LinkedPath) or is_below(real, parent)):
-                    log.warning(
-                        "%s: skipped, because this link leads to %s; pass --set follow_links=true to follow it",
-                        entry.path,
-                        real,
-                    )
+                    words = "%s: skipped, because this link leads to %s; pass --set follow_links=true to follow it"
+                    log.warning(words, entry.path, real)
                 elif real not in above and real != parent:  # a link to a folder above would be followed forever
                     waiting.append((folder / entry.name, (*above, real)))
     return sorted(matches)
@@ -219,25 +219,22 @@ def check_stays_below(path: Path, tree: Path, *, in_parent: bool = False) -> Non
         real, root = real_path(path), real_path(tree)
     except ValueError as error:  # a NUL in a name
         raise InputError("a path in this folder contains an invalid character", where=tree, got=str(error)) from None
-    blobs = [str(folder.parent / "blobs") for folder in Path(root).parents if folder.name == "snapshots"][:1]
-    if not any(is_below(real, allowed) for allowed in (os.path.dirname(root) if in_parent else root, *blobs)):
-        raise InputError(
-            "a symbolic link leads out of its folder",
-            where=path,
-            got=real,
-            expected=f"a file below {tree}",
-            fix="if you trust the link, pass --set follow_links=true",
-        )
+    allowed = [os.path.dirname(root) if in_parent else root]
+    allowed += [str(folder.parent / "blobs") for folder in Path(root).parents if folder.name == "snapshots"][:1]
+    if not any(is_below(real, folder) for folder in allowed):
+        what = "a symbolic link leads out of its folder"
+        fix = "if you trust the link, pass --set follow_links=true"
+        raise InputError(what, where=path, got=real, expected=f"a file below {tree}", fix=fix)
 
 
 def real_path(path: Path) -> str:
     """Return `os.path.realpath`; on Linux the kernel resolves it in a sixth of the time."""
     with contextlib.suppress(OSError, AttributeError):  # no such file, or another system
-        number = os.open(path, os.O_PATH | os.O_CLOEXEC)
+        descriptor = os.open(path, os.O_PATH | os.O_CLOEXEC)
         try:
-            return os.readlink(f"/proc/self/fd/{number}")
+            return os.readlink(f"/proc/self/fd/{descriptor}")
         finally:
-            os.close(number)
+            os.close(descriptor)
     return os.path.realpath(path)
 
 
@@ -259,13 +256,13 @@ def inside(root: Path, name: str, *, in_parent: bool = False) -> Path:
 def _plain_name(root: Path, name: str) -> str:
     """Return a normalized name without `..`; a link may still lead out."""
     plain = os.path.normpath(name)
-    if "\0" in name or max(len(part.encode("utf-8", "surrogatepass")) for part in plain.split(os.sep)) > LONGEST_NAME:
+    parts = plain.split(os.sep)
+    if "\0" in name or max(len(part.encode("utf-8", "surrogatepass")) for part in parts) > LONGEST_NAME:
         expected = f"no null character, and at most {LONGEST_NAME} bytes in the name of each folder and file"
         raise InputError("a path in this folder is not valid", where=root, got=name, expected=expected)
-    if os.path.isabs(plain) or plain.split(os.sep)[0] == os.pardir:
-        raise InputError(
-            "a path leads out of this folder", where=root, got=name, expected="a relative path inside the folder"
-        )
+    if os.path.isabs(plain) or parts[0] == os.pardir:
+        expected = "a relative path inside the folder"
+        raise InputError("a path leads out of this folder", where=root, got=name, expected=expected)
     return plain
 
 
@@ -320,7 +317,7 @@ def _renamed(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         for name in os.listdir(path.parent):
             owner = name.removeprefix(begin).removesuffix(end)
-            if name == f"{begin}{owner}{end}" and owner.isdecimal() and not _is_another(int(owner)):
+            if name == f"{begin}{owner}{end}" and owner.isdecimal() and not _is_other_process(int(owner)):
                 _remove(path.with_name(name))
         try:
             yield partial
@@ -331,8 +328,8 @@ def _renamed(path: Path) -> Iterator[Path]:
             raise
 
 
-def _is_another(pid: int) -> bool:
-    """Return whether another running process has this id."""
+def _is_other_process(pid: int) -> bool:
+    """Return whether another running process has this id; a file with our own id is left over from an earlier one."""
     with contextlib.suppress(PermissionError):
         try:
             os.kill(pid, 0)
@@ -381,7 +378,8 @@ def read_checksums(folder: Path) -> dict[str, str]:
     for number, line in enumerate(read_text(path, what="checksums", tree=folder).splitlines(), 1):
         digest, _, name = line.partition("  ")
         if len(digest) != 64 or not name:
-            what, fix = "this line of the checksum file is damaged", "copy the folder again from its source"
+            what = "this line of the checksum file is damaged"
+            fix = "copy the folder again from its source"
             expected = "64 hexadecimal digits, two spaces and a file name"
             raise InputError(what, where=f"{path}:{number}", got=line[:80], expected=expected, fix=fix)
         plain = _plain_name(folder, name)

@@ -24,13 +24,14 @@ class Journal:
 
     `append` returns when the line is on the disk, or with `sync=False` when the system holds it, which survives a kill
     of this process; `sync` then waits for the disk. `read` skips lines that a kill cut short or that were damaged and
-    counts them in `num_damaged`; their items are done again. `line_num`, `line_byte`: Number and first byte of the line
-    that was read last.
+    counts them in `num_damaged`; their items are done again.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.num_damaged = self.line_num = self.line_byte = 0
+        self.num_damaged = 0
+        self.line_num = 0  # of the line that was read last, from 1
+        self.line_byte = 0  # first byte of this line
         self._file: Any = None
         self._lock = threading.Lock()
 
@@ -58,12 +59,10 @@ class Journal:
             except ValidationError as error:
                 detail = error.errors(include_url=False, include_input=False)[0]
                 field = ".".join(str(part)[:40] for part in detail["loc"]) or "top level"
-                raise InputError(
-                    "this line of the journal is not a valid record",
-                    where=f"{self.path}:{self.line_num}",
-                    got=f"{field}: {plain(detail['msg'])[:200]}",
-                    fix="delete this line and run the same command again; cosfly repeats the item of this line",
-                ) from None
+                what = "this line of the journal is not a valid record"
+                got = f"{field}: {plain(detail['msg'])[:200]}"
+                fix = "delete this line and run the same command again; cosfly repeats the item of this line"
+                raise InputError(what, where=f"{self.path}:{self.line_num}", got=got, fix=fix) from None
             yield value
 
     def read_at(self, line_bytes: Iterable[int]) -> Iterator[dict]:
@@ -76,11 +75,9 @@ class Journal:
                     file.seek(line_byte)
                     record = _record_of(file.readline())
                 if record is None:
-                    raise InputError(
-                        "a line of the journal was changed while the command was running",
-                        where=f"{self.path}: byte {line_byte}",
-                        fix="run the same command again; cosfly repeats the item of this line",
-                    )
+                    what = "a line of the journal was changed while the command was running"
+                    fix = "run the same command again; cosfly repeats the item of this line"
+                    raise InputError(what, where=f"{self.path}: byte {line_byte}", fix=fix)
                 yield record
 
     def append(self, record: dict, *, sync: bool = True) -> int:

@@ -10,6 +10,7 @@ import math
 import re
 import reprlib
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -17,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import SchemaValidator, from_json
 
 from cosfly.runtime.errors import InputError, json_type, plain, shown
-from cosfly.runtime.io import CHECK_PATH, FILE_MB, decoded, read_bytes, read_lines, write_bytes
+from cosfly.runtime.io import FILE_MB, decoded, read_bytes, read_lines, write_bytes
 
 Model = TypeVar("Model", bound=BaseModel)
 Kind = TypeVar("Kind")
@@ -35,7 +36,8 @@ _COMPACT = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(","
 
 
 def _finite(text: str) -> float:
-    if not math.isfinite(number := float(text)):
+    number = float(text)
+    if not math.isfinite(number):
         raise ValueError(f"the number {reprlib.repr(text)[1:-1]} is not finite")
     return number
 
@@ -66,18 +68,18 @@ def parse_json(text: str | bytes, *, unique_keys: bool = False) -> Any:
     value = from_json(data, allow_inf_nan=False)
     if num_groups > DEPTH and is_deep(value):
         raise ValueError(f"lists and objects are nested deeper than {DEPTH} levels")
-    if unique_keys or _SUSPECT.search(data):
+    if unique_keys or _SUSPECT.search(data):  # parsed again for the errors alone
         json.loads(data, parse_float=_finite, parse_int=_integer, object_pairs_hook=_unique if unique_keys else None)
     return value
 
 
 def is_deep(value: Any) -> bool:
     """Return whether lists and objects are nested deeper than DEPTH."""
-    level = [value]
+    groups = [value]  # of one level
     for _ in range(DEPTH + 1):
-        members = (member for group in level for member in (group.values() if type(group) is dict else group))
-        level = [member for member in members if type(member) is dict or type(member) is list]
-        if not level:
+        members = chain.from_iterable(group.values() if type(group) is dict else group for group in groups)
+        groups = [member for member in members if type(member) is dict or type(member) is list]
+        if not groups:
             return False
     return True
 
@@ -90,11 +92,9 @@ def parse_document(data: bytes | str, where: str | Path, *, unique_keys: bool = 
         raise InputError(f"the text is not valid JSON: {error}", where=where) from None
 
 
-def read_json(
-    path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None, most_mb: float = FILE_MB
-) -> Any:
+def read_json(path: Path, *, what: str = "file", tree: Path | None = None, most_mb: float = FILE_MB) -> Any:
     """Read a JSON file; arguments as for `io.read_bytes`."""
-    return parse_document(read_bytes(path, what=what, fix=fix, tree=tree, most_mb=most_mb), path)
+    return parse_document(read_bytes(path, what=what, tree=tree, most_mb=most_mb), path)
 
 
 def read_object(path: Path, *, what: str = "file", tree: Path | None = None) -> dict[str, Any]:
@@ -148,17 +148,17 @@ def validated(kind: type[Kind], value: Any, where: str | Path) -> Kind:
 
 @functools.cache
 def _validator(kind: type) -> SchemaValidator:
-    # Prebuilt validators of inner models would collect all errors.
-    return SchemaValidator(_ending_early(TypeAdapter(kind).core_schema), _use_prebuilt=False)  # type: ignore[call-arg]
+    # Prebuilt validators of inner models would collect all errors. The argument is private in pydantic-core.
+    return SchemaValidator(_with_fail_fast(TypeAdapter(kind).core_schema), _use_prebuilt=False)  # type: ignore[call-arg]
 
 
-def _ending_early(schema: Any) -> Any:
+def _with_fail_fast(schema: Any) -> Any:
     """Return a schema of pydantic with `fail_fast` in all collections."""
     if isinstance(schema, list):
-        return [_ending_early(part) for part in schema]
+        return [_with_fail_fast(part) for part in schema]
     if not isinstance(schema, dict):
         return schema
-    copied = {key: part if key in ("default", "metadata") else _ending_early(part) for key, part in schema.items()}
+    copied = {key: part if key in ("default", "metadata") else _with_fail_fast(part) for key, part in schema.items()}
     is_collection = copied.get("type") in ("list", "tuple", "set", "frozenset", "dict")
     return copied | {"fail_fast": True} if is_collection else copied
 
@@ -173,11 +173,11 @@ def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Itera
     for number, data in enumerate(read_lines(path, what=what, fix=fix), 1):
         where = f"{path}:{number}"
         value = parse_document(data, where)
-        if isinstance(value, dict) and (found := value.get("schema_version", version)) != version:
+        if isinstance(value, dict) and value.get("schema_version", version) != version:
             raise InputError(
                 f"the version of this line of the {what} is not supported",
                 where=f"{where}: schema_version",
-                got=shown(found),
+                got=shown(value["schema_version"]),
                 expected=repr(version),
                 fix=f"make the file again: {fix}",
             )
@@ -198,26 +198,26 @@ class FileFormat(NamedTuple):
 
 
 def check_schema(value: Any, form: FileFormat, path: Path | str) -> dict:
-    """Return a JSON value that is an object of the wanted schema and major version."""
+    """Return a JSON value that is an object of the schema and major version of a format."""
     if not isinstance(value, dict):
         expected = f"an object with schema {form.schema}"
         raise InputError("the file is not a JSON object", where=path, got=json_type(value), expected=expected)
-    for key, wanted in form.header.items():
-        found = value.get(key)
-        where = f"{path}: {key}"
-        if found is None:
+    for key, expected in form.header.items():
+        if value.get(key) is None:
             fix = f"pass a file that cosfly wrote with this schema ({form.what})"
-            raise InputError(MISSING, where=where, expected=repr(wanted), fix=fix)
-        is_schema = key == "schema"
-        is_right = found == wanted if is_schema else str(found).split(".")[0] == wanted.split(".")[0]
-        if not is_right:
-            what = "the file has a wrong schema" if is_schema else "the version of the file is not supported"
-            raise InputError(what, where=where, got=shown(found), expected=repr(wanted))
+            raise InputError(MISSING, where=f"{path}: {key}", expected=repr(expected), fix=fix)
+        if key == "schema" and value[key] != expected:
+            what = "the file has a wrong schema"
+        elif key == "schema_version" and str(value[key]).split(".")[0] != expected.split(".")[0]:
+            what = "the version of the file is not supported"
+        else:
+            continue
+        raise InputError(what, where=f"{path}: {key}", got=shown(value[key]), expected=repr(expected))
     return value
 
 
 def read_model(path: Path, model: type[Model], form: FileFormat, *, tree: Path | None = None) -> Model:
-    """Read a JSON file of the wanted schema and major version."""
+    """Read a JSON file of the schema and major version of a format."""
     data = read_bytes(path, what=form.what, tree=tree)
     value = check_schema(parse_document(data, path, unique_keys=True), form, path)
     return validated(model, {key: v for key, v in value.items() if key not in form.header}, path)

@@ -8,6 +8,7 @@ is a failure with a reason.
 """
 
 import json
+import math
 import re
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
@@ -31,9 +32,11 @@ _MARK = re.compile(
 DECLINED = "declined"  # finish reason: the model declines to answer, in its own words
 CONTEXT_FULL = "context_full"  # finish reason: prompt and answer fill the context, before `max_tokens`
 _NOTHING = re.compile(r"(?:[\s\u00ad\u200b-\u200f\u2028-\u202e\u2060-\u2064\ufeff]|```\w*)*+")
-# Finish reason -> ours, of a message that was cut off or declines to answer.
-_CUT = {"length": "cut_short", "max_tokens": "cut_short"}
-_CUT |= {name: name for name in ("content_filter", CONTEXT_FULL, DECLINED)}
+# Finish reason of a message that was cut off or declines to answer -> ours.
+_CUT = {
+    "length": "cut_short", "max_tokens": "cut_short", "content_filter": "content_filter",
+    CONTEXT_FULL: CONTEXT_FULL, DECLINED: DECLINED,
+}  # fmt: skip
 
 _KEY = re.compile(r'\s*"')
 # Half a surrogate pair, which cannot be written, and the replacement of bytes that a decoder could not read.
@@ -42,12 +45,33 @@ _UNREADABLE = re.compile("[\ud800-\udfff\ufffd]")
 
 @dataclass(frozen=True)
 class AnswerObject:
-    """The object, or None and the reason. recovered: The kinds of text around it. is_end: No text follows it."""
+    """The object in an answer, or the reason why there is none."""
 
     value: dict[str, Any] | None
     reason: str | None = None
-    recovered: tuple[str, ...] = ()
-    is_end: bool = True
+    recovered: tuple[str, ...] = ()  # the kinds of text around it
+    is_end: bool = True  # no text follows it
+
+
+@dataclass
+class _Object:
+    """A complete object, text[start:end]."""
+
+    value: dict[str, Any]
+    start: int
+    end: int
+    problem: str | None  # the reason why its value is refused
+
+
+@dataclass
+class _Message:
+    """The final message of a text."""
+
+    start: int = 0
+    has_thoughts: bool = False  # before it
+    is_thought: bool = False  # it ends within thoughts
+    objects: list[_Object] = field(default_factory=list)
+    broken_at: int = -1  # the position of the last object without an end
 
 
 def find_object(text: str, names: Collection[str], finish_reason: str | None = None) -> AnswerObject:
@@ -69,23 +93,12 @@ def find_object(text: str, names: Collection[str], finish_reason: str | None = N
 def _last_object(text: str, names: Collection[str]) -> AnswerObject:
     message = _read_message(text)
     for candidate in reversed(message.objects):
-        if (inner := _unwrapped(candidate.value, names)) is None:
+        inner = _unwrapped(candidate.value, names)
+        if inner is None:
             continue
-        if message.broken_at >= candidate.end:
+        if message.broken_at >= candidate.end:  # a later object, which was meant to replace this one, has no end
             break
-        around = (text[message.start : candidate.start], text[candidate.end :])
-        problem = candidate.problem
-        if problem is None and _UNREADABLE.search(json.dumps(inner, ensure_ascii=False)):
-            problem = "unreadable_character"
-        recovered = {
-            "thinking_tags": message.has_thoughts,
-            "code_fence": any("```" in part for part in around),
-            "prose_around": not all(_NOTHING.fullmatch(part) for part in around),
-            "wrapped": inner is not candidate.value,
-        }
-        kinds = tuple(filter(recovered.get, recovered))
-        is_end = _NOTHING.fullmatch(around[1]) is not None
-        return AnswerObject(None if problem else inner, problem, kinds, is_end)
+        return _answer_object(text, message, candidate, inner)
     if message.broken_at >= 0:
         return AnswerObject(None, "broken_json", is_end=False)
     if message.objects:
@@ -96,12 +109,31 @@ def _last_object(text: str, names: Collection[str]) -> AnswerObject:
     return AnswerObject(None, "empty" if _NOTHING.fullmatch(text) else "no_json_object")
 
 
+def _answer_object(text: str, message: _Message, candidate: _Object, inner: dict[str, Any]) -> AnswerObject:
+    """Return the answer whose object is a candidate of the message, or an object inside it."""
+    before = text[message.start : candidate.start]
+    after = text[candidate.end :]
+    is_end = _NOTHING.fullmatch(after) is not None
+    recovered = {
+        "thinking_tags": message.has_thoughts,
+        "code_fence": "```" in before or "```" in after,
+        "prose_around": not (is_end and _NOTHING.fullmatch(before)),
+        "wrapped": inner is not candidate.value,
+    }
+    kinds = tuple(kind for kind, is_found in recovered.items() if is_found)
+    problem = candidate.problem
+    if problem is None and _UNREADABLE.search(json.dumps(inner, ensure_ascii=False)):
+        problem = "unreadable_character"
+    return AnswerObject(None if problem else inner, problem, kinds, is_end)
+
+
 def _unwrapped(value: dict[str, Any], names: Collection[str]) -> dict[str, Any] | None:
     """Return the object with one of the names: this one, or the only one among its values; else None."""
     if not value.keys().isdisjoint(names):
         return value
-    members = [member for member in map(_object_of, value.values()) if member and not member.keys().isdisjoint(names)]
-    return members[0] if len(members) == 1 else None
+    members = [_object_of(member) for member in value.values()]
+    named = [member for member in members if member and not member.keys().isdisjoint(names)]
+    return named[0] if len(named) == 1 else None
 
 
 def _object_of(member: Any) -> dict[str, Any] | None:
@@ -118,34 +150,12 @@ def _object_of(member: Any) -> dict[str, Any] | None:
 # --- where the objects are --------------------------------------------------------------------------------------------
 
 
-@dataclass
-class _Object:
-    """A complete object, text[start:end]. problem: the reason why its value is refused."""
-
-    value: dict[str, Any]
-    start: int
-    end: int
-    problem: str | None
-
-
-@dataclass
-class _Message:
-    """The objects of the final message, which begins at `start`.
-
-    is_thought: It ends within thoughts. broken_at: The position of the last object without an end.
-    """
-
-    start: int = 0
-    has_thoughts: bool = False
-    is_thought: bool = False
-    objects: list[_Object] = field(default_factory=list)
-    broken_at: int = -1
-
-
 def _read_message(text: str) -> _Message:
     read_object = _reader()
     message = _Message()
-    position, num_broken, last_brace = 0, 0, text.rfind("}")
+    position = 0
+    num_broken = 0
+    last_brace = text.rfind("}")
     while mark := _MARK.search(text, position):
         position = mark.end()
         if mark.lastgroup is not None:  # everything before is thought, or a draft
@@ -159,7 +169,8 @@ def _read_message(text: str) -> _Message:
                 has_key = _KEY.match(text, position) is not None
                 if has_key or last_brace < position:
                     message.broken_at = mark.start()
-                num_broken += has_key  # without a key, reading ends at once
+                if has_key:  # without a key, reading has ended at once
+                    num_broken += 1
                 if num_broken > MAX_BROKEN:
                     message.broken_at = len(text)
                     break
@@ -171,12 +182,14 @@ def _reader() -> Callable[[str, int], _Object]:
     problems = list[str]()
 
     def members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(value := dict(pairs)) < len(pairs):
+        value = dict(pairs)
+        if len(value) < len(pairs):
             problems.append("duplicate_key")
         return value
 
     def finite(word: str) -> float:
-        if not abs(value := float(word)) < float("inf"):
+        value = float(word)
+        if not math.isfinite(value):
             problems.append("not_finite")
         return value
 

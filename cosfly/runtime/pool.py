@@ -49,14 +49,11 @@ Transport = LocalTransport | RayTransport
 
 @dataclass(frozen=True)
 class Watch:
-    """The place of the workers, and the time limits after which one has stalled: the paper's (sec:dataset_watchdog).
+    """The place of the workers, and the time limits after which one has stalled: the paper's (sec:dataset_watchdog)."""
 
-    ray: The Ray cluster; None runs the workers on this machine.
-    item_limit_s: The longest time in which an item may report no step; 0 disables the limit. None sets it to ten
-        minutes or 20 times the median duration of an item, whichever is longer, and doubles it with each attempt.
-    """
-
-    ray: RayConfig | None = None
+    ray: RayConfig | None = None  # the Ray cluster; None runs the workers on this machine
+    # The longest time in which an item may report no step; 0 disables the limit. None sets it to ten minutes or 20
+    # times the median duration of an item, whichever is longer, and doubles it with each attempt.
     item_limit_s: float | None = None
     heartbeat_s: float = 2.0
     check_s: float = 5.0
@@ -133,12 +130,10 @@ def run_items(
     write_failures(stage.path / "failures.jsonl", filter(None, map(tally.count, finished.records)))
     if "worker_died" in tally.failed:
         # The cause is the machine, not the item, so it must not become a result: the stage stays incomplete.
-        raise EnvironmentMissing(
-            "a worker process died in each of three attempts at the same item",
-            where=stage.path,
-            got=f"{tally.failed['worker_died']} of {len(items)} items without a result",
-            fix=f"free some memory or use fewer --workers, {RUN_AGAIN}",
-        )
+        what = "a worker process died in each of three attempts at the same item"
+        got = f"{tally.failed['worker_died']} of {len(items)} items without a result"
+        fix = f"free some memory or use fewer --workers, {RUN_AGAIN}"
+        raise EnvironmentMissing(what, where=stage.path, got=got, fix=fix)
     return finished
 
 
@@ -447,12 +442,10 @@ class WorkerPool:
             self.on_steps(attempt.item, 0)
         self.events.write(loss, **fields)
         if self.num_lost > self.watch.restarts + self._num_done:
-            raise EnvironmentMissing(
-                "too many worker processes died or stalled",
-                where=None if attempt is None else attempt.item.item_id,
-                got=f"{self.num_lost} workers lost, {self._num_done} items done; in the last loss, {LOSSES[loss]}",
-                fix=f"see events.jsonl; free some memory, use fewer --workers or raise item_limit_s, {RUN_AGAIN}",
-            )
+            what = "too many worker processes died or stalled"
+            got = f"{self.num_lost} workers lost, {self._num_done} items done; in the last loss, {LOSSES[loss]}"
+            fix = f"see events.jsonl; free some memory, use fewer --workers or raise item_limit_s, {RUN_AGAIN}"
+            raise EnvironmentMissing(what, where=None if attempt is None else attempt.item.item_id, got=got, fix=fix)
         if attempt is not None:
             yield from self._retry_or_fail(attempt, loss)
 

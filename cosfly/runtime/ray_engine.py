@@ -57,37 +57,33 @@ class RayConfig(Config):
 
 
 class Cluster:
-    """A cluster whose nodes share the folder of a stage.
-
-    room: The number of workers that fit on its nodes when they are idle. needs: The resources of a worker, in words.
-    """
+    """A cluster whose nodes share the folder of a stage."""
 
     def __init__(self, cfg: RayConfig, folder: Path) -> None:
         self._folder = folder
         self._ray = connected(cfg)
         self._record_sha256 = sha256_file(folder / "stage.json")
-        self._takes = {"num_cpus": cfg.worker_cpus, "num_gpus": cfg.worker_gpus, "max_restarts": 0}
+        self._actor_options = {"num_cpus": cfg.worker_cpus, "num_gpus": cfg.worker_gpus, "max_restarts": 0}
         shares = {"CPU": cfg.worker_cpus}
         if cfg.worker_gpus:
             shares["GPU"] = cfg.worker_gpus
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
-        self.room = 0
+        self.room = 0  # the number of workers that fit on the nodes when they are idle
         for node in nodes:
             self.room += min(int(node.get(name, 0.0) / share + ROUNDING) for name, share in shares.items())
+        # The resources of a worker, in words.
         self.needs = " and ".join(f"{share:g} {name}s" for name, share in shares.items())
         if not self.room:
             got = ", ".join(f"{node.get('CPU', 0):g} CPUs and {node.get('GPU', 0):g} GPUs" for node in nodes)
-            raise EnvironmentMissing(
-                "no node is large enough for a worker",
-                got=f"nodes with {got}",
-                expected=f"a node with at least {self.needs}",
-                fix="lower ray.worker_cpus or ray.worker_gpus, or add a larger node",
-            )
+            what = "no node is large enough for a worker"
+            expected = f"a node with at least {self.needs}"
+            fix = "lower ray.worker_cpus or ray.worker_gpus, or add a larger node"
+            raise EnvironmentMissing(what, got=f"nodes with {got}", expected=expected, fix=fix)
         self._actor = self._ray.remote(_host())
 
     def start_transport(self, *options: Any) -> RayTransport:
         """Request a worker on any node; the options are the arguments of `LocalTransport`."""
-        host = self._actor.options(**self._takes).remote()
+        host = self._actor.options(**self._actor_options).remote()
         started = host.start.remote(
             options, str(self._folder), self._record_sha256, os.getcwd(), sys.path, cosfly.__version__
         )
@@ -116,10 +112,9 @@ class RayTransport:
         with self._gone_as_eof():
             while self.pid is None:
                 if self._ray.wait([self._started], timeout=WAITING_S)[0]:
-                    node, pid, problem = self._ray.get(self._started)
+                    self.node, self.pid, problem = self._ray.get(self._started)
                     if problem:
-                        raise EnvironmentMissing(where=f"node {node}", **problem)
-                    self.node, self.pid = node, pid
+                        raise EnvironmentMissing(where=f"node {self.node}", **problem)
                 elif self._worker_index == 0:
                     log.warning("worker 0 waits until a node has %s free; run `ray status` for details", self._needs)
             self._call = self._host.exchange.remote(data)
@@ -129,7 +124,8 @@ class RayTransport:
             if self._vitals is None:
                 raise EOFError
             with self._gone_as_eof():
-                call, self._call = self._call or self._host.exchange.remote(None), None
+                call = self._call or self._host.exchange.remote(None)
+                self._call = None
                 received, vitals = self._ray.get(call)
             self._received.extend(received)
             self._vitals = None if vitals is None else Vitals(*vitals)
@@ -175,39 +171,15 @@ def _host() -> type:
             import socket
             import sys
             import threading
-            from pathlib import Path
 
             import ray
 
             node = socket.gethostname()
-            python = f"Python {sys.executable}"
-            try:
-                import cosfly
-            except ImportError as error:
-                fix = f"install cosfly {version} on the node, or start Ray there with the Python that has cosfly"
-                return (
-                    node,
-                    None,
-                    {"what": "cosfly is not installed on the node", "got": f"{error} ({python})", "fix": fix},
-                )
-            if cosfly.__version__ != version:
-                fix = "install the same version on every node, then start Ray again on the nodes"
-                got = f"{cosfly.__version__} ({python})"
-                what = "the node has a different version of cosfly"
-                return node, None, {"what": what, "got": got, "expected": version, "fix": fix}
-            from cosfly.runtime.errors import InputError
-            from cosfly.runtime.io import sha256_file
+            problem = self._find_problem(folder, record_sha256, cwd, version)
+            if problem is not None:
+                return node, None, problem
             from cosfly.runtime.worker import LocalTransport
 
-            try:
-                os.chdir(cwd)
-                is_same = sha256_file(Path(folder) / "stage.json") == record_sha256
-            except (OSError, InputError):
-                is_same = False
-            if not is_same:
-                got = f"no folder {Path(cwd) / folder}, or one with a different stage.json"
-                fix = "put the run directory and the inputs on storage that all nodes mount at the same path"
-                return node, None, {"what": "the node cannot read the folder of the stage", "got": got, "fix": fix}
             if devices := ray.get_gpu_ids():
                 os.environ.setdefault("GLCONTEXT_DEVICE_INDEX", str(devices[0]))  # EGL lists NVIDIA devices first
             sys.path.extend(entry for entry in path if entry not in sys.path)  # a spawned process inherits it
@@ -217,6 +189,37 @@ def _host() -> type:
             self.worker = LocalTransport(*options)
             threading.Thread(target=self._send, daemon=True).start()
             return node, self.worker.pid, None
+
+        def _find_problem(self, folder: str, record_sha256: str, cwd: str, version: str) -> dict[str, str] | None:
+            """Enter `cwd` and check this node; return the arguments of an error, or None."""
+            import os
+            import sys
+            from pathlib import Path
+
+            python = f"Python {sys.executable}"
+            try:
+                import cosfly
+            except ImportError as error:
+                fix = f"install cosfly {version} on the node, or start Ray there with the Python that has cosfly"
+                return {"what": "cosfly is not installed on the node", "got": f"{error} ({python})", "fix": fix}
+            if cosfly.__version__ != version:
+                fix = "install the same version on every node, then start Ray again on the nodes"
+                got = f"{cosfly.__version__} ({python})"
+                what = "the node has a different version of cosfly"
+                return {"what": what, "got": got, "expected": version, "fix": fix}
+            from cosfly.runtime.errors import InputError
+            from cosfly.runtime.io import sha256_file
+
+            try:
+                os.chdir(cwd)
+                is_same = sha256_file(Path(folder) / "stage.json") == record_sha256
+            except (OSError, InputError):
+                is_same = False
+            if is_same:
+                return None
+            got = f"no folder {Path(cwd) / folder}, or one with a different stage.json"
+            fix = "put the run directory and the inputs on storage that all nodes mount at the same path"
+            return {"what": "the node cannot read the folder of the stage", "got": got, "fix": fix}
 
         def _send(self) -> None:
             try:
@@ -236,7 +239,9 @@ def _host() -> type:
             except (EOFError, OSError):
                 return received, None
             vitals = self.worker.look()
-            return received, None if vitals is None and not received else tuple(vitals or (0.0, 0.0))[:2]
+            if vitals is not None:
+                return received, tuple(vitals)
+            return received, (0.0, 0.0) if received else None  # its last messages come before the news of its end
 
         def end(self, patience_s: float) -> None:
             """End the worker and wait until it is gone."""

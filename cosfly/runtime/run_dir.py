@@ -114,16 +114,14 @@ class StageInput(_Record):
 
 
 class StageRecord(_Record):
-    """`stage.json`: the settings, inputs and version with which a folder was started.
-
-    package_files: sha256 of data that are part of cosfly and may change with its version, such as prompts.
-    """
+    """`stage.json`: the settings, inputs and version with which a folder was started."""
 
     stage: str
     config: dict[str, Any]
     seed: int
     inputs: dict[str, StageInput]
     code_version: str
+    # sha256 of data that are part of cosfly and may change with its version, such as prompts.
     package_files: dict[str, str] = Field({}, exclude_if=lambda digests: not digests)
 
 
@@ -295,17 +293,9 @@ class StageFolder:
         )
         if out.exists() and not out.is_dir():
             raise StorageError("the output path is a file, not a folder", where=out, fix="choose another --out")
-        if (out / "manifest.json").exists():
-            manifest = read_manifest(out)
-            _check_same(out, record)
-            if not (retries and manifest.counts.failed):
-                _check_outputs_exist(out, manifest)
-                # A kill has left the lock file, unless it is held or the disk is read-only.
-                if (out / LOCK).exists():
-                    with contextlib.suppress(ResumeError, StorageError):
-                        hold_folder(out).release()
-                log.debug("%s: complete for the same settings and inputs: %s", stage, out)
-                return cls(out, stage, True)
+        if (out / "manifest.json").exists() and _is_complete(out, record, retries=retries):
+            log.debug("%s: complete for the same settings and inputs: %s", stage, out)
+            return cls(out, stage, True)
         lock = hold_folder(out)
         try:
             _prepare_resume(out, record, (*BEGUN, *begun))
@@ -365,11 +355,23 @@ class StageFolder:
         failures = read_failures(path) if path.exists() else []
         if failures:
             got += f"; the first failure: {failures[0].message}"
-        fix = (
-            fix or "fix the causes listed in failures.jsonl and items.jsonl, or choose other settings and another --out"
-        )
+        if fix is None:
+            fix = "fix the causes listed in failures.jsonl and items.jsonl, or choose other settings and another --out"
         what = f"{self.stage} kept nothing, so the next stage has no input"
         return NothingKept(what, where=where or self.path, got=got, expected=expected, fix=fix)
+
+
+def _is_complete(out: Path, record: StageRecord, *, retries: bool) -> bool:
+    """Return whether a folder with a manifest has nothing to do; raise if it holds other work or lacks outputs."""
+    manifest = read_manifest(out)
+    _check_same(out, record)
+    if retries and manifest.counts.failed:
+        return False
+    _check_outputs_exist(out, manifest)
+    if (out / LOCK).exists():  # a kill has left it, unless it is held or the disk is read-only
+        with contextlib.suppress(ResumeError, StorageError):
+            hold_folder(out).release()
+    return True
 
 
 def _prepare_resume(out: Path, record: StageRecord, begun: Collection[str]) -> None:
@@ -384,8 +386,12 @@ def _prepare_resume(out: Path, record: StageRecord, begun: Collection[str]) -> N
     else:
         # An attempt that finished nothing may be repeated with other settings. Its stage.json stays until the new one
         # is written: without it, the other files would look foreign after a kill.
-        for path in (out / name for name in begun if name != "stage.json"):
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        for name in begun:
+            path = out / name
+            if path.is_dir():
+                shutil.rmtree(path)
+            elif name != "stage.json":
+                path.unlink(missing_ok=True)
 
 
 def _holds_work(out: Path, begun: Collection[str]) -> bool:
@@ -403,13 +409,15 @@ def _holds_work(out: Path, begun: Collection[str]) -> bool:
 def _check_same(out: Path, record: StageRecord) -> None:
     """Raise ResumeError if `record` does not agree with the record of the work in a folder."""
     previous = read_stage_record(out)
-    before = flattened(previous.config) | {"seed": previous.seed}
-    after = flattened(record.config) | {"seed": record.seed}
-    differences = [
-        f"{key} was {shown(before.get(key))}, is {shown(after.get(key))}"
-        for key in sorted(before.keys() | after.keys(), key=lambda key: (key == "seed", key))
-        if before.get(key) != after.get(key)
-    ]
+    before = flattened(previous.config)
+    after = flattened(record.config)
+    differences = []
+    for key in [*sorted((before.keys() | after.keys()) - {"seed"}), "seed"]:
+        old_value, new_value = before.get(key), after.get(key)
+        if key == "seed":
+            old_value, new_value = previous.seed, record.seed
+        if old_value != new_value:
+            differences.append(f"{key} was {shown(old_value)}, is {shown(new_value)}")
     for name in sorted(previous.inputs.keys() | record.inputs.keys()):
         old = previous.inputs.get(name)
         new = record.inputs.get(name)
@@ -419,12 +427,9 @@ def _check_same(out: Path, record: StageRecord) -> None:
         if record.package_files.get(name, digest) != digest:
             differences.append(f"the {name} has changed")
     if differences:
-        raise ResumeError(
-            "the folder contains results made with other settings or inputs",
-            where=out,
-            got="; ".join(differences),
-            fix="choose another --out, or restore the previous settings and inputs",
-        )
+        what = "the folder contains results made with other settings or inputs"
+        fix = "choose another --out, or restore the previous settings and inputs"
+        raise ResumeError(what, where=out, got="; ".join(differences), fix=fix)
     if previous.code_version != record.code_version:
         log.warning(
             "%s: cosfly %s resumes a stage that cosfly %s started", out, record.code_version, previous.code_version
@@ -441,20 +446,19 @@ def flattened(config: Any, prefix: str = "") -> dict[str, Any]:
     """Return all values of nested objects by their dotted paths."""
     if not isinstance(config, dict) or not config:
         return {prefix: config}
-    parts = (flattened(value, f"{prefix}.{key}".removeprefix(".")) for key, value in config.items())
-    return {name: value for part in parts for name, value in part.items()}
+    values: dict[str, Any] = {}
+    for key, value in config.items():
+        values |= flattened(value, f"{prefix}.{key}".removeprefix("."))
+    return values
 
 
 def _check_outputs_exist(out: Path, manifest: Manifest) -> None:
     for entry in manifest.outputs:
         path = inside(out, entry.path)
         if not path.is_file() or path.stat().st_size != entry.bytes:
-            raise VerifyError(
-                "an output file of a finished stage is missing or has another size",
-                where=path,
-                expected=f"{entry.bytes} bytes",
-                fix=f"remove {out} and run the stage again",
-            )
+            what = "an output file of a finished stage is missing or has another size"
+            fix = f"remove {out} and run the stage again"
+            raise VerifyError(what, where=path, expected=f"{entry.bytes} bytes", fix=fix)
 
 
 # --- digests of products ----------------------------------------------------------------------------------------------
@@ -565,31 +569,26 @@ def _check_finished(path: Path) -> None:
                 problems.append(f"{file} has changed")
     if problems:
         more = f" and {len(problems) - NUM_NAMED} more" if len(problems) > NUM_NAMED else ""
-        raise VerifyError(
-            "files of this stage were changed after it finished",
-            where=folder,
-            got="; ".join(problems[:NUM_NAMED]) + more,
-            expected="files with the digests that the stage recorded",
-            fix="restore the files or run the stage again; to use a file that you changed, copy it to an empty folder",
-        )
+        what = "files of this stage were changed after it finished"
+        expected = "files with the digests that the stage recorded"
+        fix = "restore the files or run the stage again; to use a file that you changed, copy it to an empty folder"
+        raise VerifyError(what, where=folder, got="; ".join(problems[:NUM_NAMED]) + more, expected=expected, fix=fix)
 
 
 def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], records: Mapping[str, StageInput]) -> None:
     """Check that an input was made from the other inputs of the same run, as far as its stage read them."""
-    if (record := record_of(path)) is None:
+    record = record_of(path)
+    if record is None:
         return
     run = name.rpartition(".")[0]
     peers = {_role(other): other for other in inputs if other.rpartition(".")[0] == run}
     for role, peer in peers.items():
         sources = [entry for source, entry in record.inputs.items() if _role(source) == role]
         if sources and peer != name and all(entry.sha256 != records[peer].sha256 for entry in sources):
-            raise VerifyError(
-                f"{path.name} was made with another input `{role}`, or that input has changed since",
-                where=path,
-                got=str(inputs[peer]),
-                expected=f"{sources[0].path}, unchanged since then",
-                fix=f"pass the expected input, or run the stage that writes {path.name} again",
-            )
+            what = f"{path.name} was made with another input `{role}`, or that input has changed since"
+            expected = f"{sources[0].path}, unchanged since then"
+            fix = f"pass the expected input, or run the stage that writes {path.name} again"
+            raise VerifyError(what, where=path, got=str(inputs[peer]), expected=expected, fix=fix)
 
 
 def _role(name: str) -> str:

@@ -5,7 +5,7 @@ import contextlib
 import io
 import os
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from itertools import accumulate
 from pathlib import Path
@@ -37,15 +37,17 @@ def arrow_errors(path: Path | str) -> Iterator[None]:
 
 
 class _Table(pq.ParquetFile):
-    """A parquet file. packed: The same file, read with texts as dictionaries and indices."""
+    """A parquet file."""
 
     def __init__(self, file: io.IOBase) -> None:
         limits = {"thrift_string_size_limit": MOST_FOOTER_BYTES, "thrift_container_size_limit": MOST_FOOTER_BYTES}
         super().__init__(file, **limits)
-        leaves = [self.schema.column(j) for j in range(len(self.schema))]
-        texts = [
-            leaf.path for j, leaf in enumerate(leaves) if leaf.logical_type.type == "STRING" or self._has_dictionary(j)
-        ]
+        texts = []
+        for j in range(len(self.schema)):
+            leaf = self.schema.column(j)
+            if leaf.logical_type.type == "STRING" or self._has_dictionary(j):
+                texts.append(leaf.path)
+        # The same file, read with texts as dictionaries and indices.
         self.packed = pq.ParquetFile(file, metadata=self.metadata, read_dictionary=texts, **limits)
 
     def _has_dictionary(self, j: int) -> bool:
@@ -64,14 +66,11 @@ def open_table(path: Path, *, tree: Path | None = None) -> Iterator[_Table]:
             yield table
 
 
-def row_groups(
-    path: Path, columns: list[str] | None = None, *, tree: Path | None = None, wanted: Collection[int] | None = None
-) -> Iterator[pa.Table]:
-    """Yield row groups of a parquet file one at a time, all or those in `wanted`; InputError over the limit."""
+def row_groups(path: Path, columns: list[str] | None = None, *, tree: Path | None = None) -> Iterator[pa.Table]:
+    """Yield the row groups of a parquet file one at a time; InputError over the limit."""
     with open_table(path, tree=tree) as table:
         for k in range(table.num_row_groups):
-            if wanted is None or k in wanted:
-                yield read_row_group(path, table, k, columns)
+            yield read_row_group(path, table, k, columns)
 
 
 def read_row_group(path: Path | str, table: _Table, k: int, columns: list[str] | None) -> pa.Table:
@@ -124,9 +123,8 @@ def _check_size(path: Path | str, table: _Table, k: int) -> None:
         raise over_limit(f"{path}: row group {k}", f"{size / MB:,.0f} MB", f"{FILE_MB:,} MB", SMALLER_GROUPS)
     chunks = [metadata.column(j) for j in range(metadata.num_columns)]
     num_items = sum(chunk.num_values - metadata.num_rows for chunk in chunks)  # a list of n items counts n - 1
-    most = (
-        max(SMALL_UNPACKED_MB * MB, UNPACK_FACTOR * sum(chunk.total_compressed_size for chunk in chunks)) / ITEM_BYTES
-    )
+    stored = sum(chunk.total_compressed_size for chunk in chunks)
+    most = max(SMALL_UNPACKED_MB * MB, UNPACK_FACTOR * stored) / ITEM_BYTES
     if num_items > most:
         raise over_limit(f"{path}: row group {k}", f"lists of {num_items:,} items", f"{most:,.0f}", SMALLER_GROUPS)
 
@@ -139,16 +137,16 @@ def rows_of(path: Path, columns: list[str] | None = None, *, tree: Path | None =
 
 
 class TableRows(Sequence[dict[str, Any]]):
-    """The rows of a parquet file by number. Each process opens the file once and keeps a few row groups in memory."""
+    """The rows of a parquet file by index. Each process opens the file once and keeps a few row groups in memory."""
 
     def __init__(self, path: Path, columns: list[str]) -> None:
         self._path = path
         self._columns = columns
-        self._stack = contextlib.ExitStack()
-        self._process = -1
+        self._stack = contextlib.ExitStack()  # keeps the file open
+        self._process = -1  # the process that has opened it
         self._lock = threading.Lock()
-        self._firsts: list[int] = []  # number of the first row of each group, then the number of rows
-        self._group: Callable[[int], pa.Table]
+        self._starts: list[int] = []  # index of the first row of each group, then the number of rows
+        self._group: Callable[[int], pa.Table]  # set by `_open`
 
     def __reduce__(self) -> tuple:
         return type(self), (self._path, self._columns)
@@ -160,23 +158,23 @@ class TableRows(Sequence[dict[str, Any]]):
                 noun = "column" if len(missing) == 1 else "columns"
                 raise InputError(f"the table does not have the {noun} {', '.join(missing)[:200]}", where=self._path)
             counts = (table.metadata.row_group(k).num_rows for k in range(table.num_row_groups))
-            self._firsts = list(accumulate(counts, initial=0))
+            self._starts = list(accumulate(counts, initial=0))
             self._group = lru_cache(GROUPS_HELD)(lambda k: read_row_group(self._path, table, k, self._columns))
             self._process = os.getpid()
             self._lock = threading.Lock()
 
     def __len__(self) -> int:
         self._open()
-        return self._firsts[-1]
+        return self._starts[-1]
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         return rows_of(self._path, self._columns)
 
-    def __getitem__(self, number: int) -> dict[str, Any]:  # type: ignore[override]  # one row at a time
-        if not 0 <= number < len(self):
-            raise IndexError(f"row {number} does not exist: the table has {len(self)} rows")
-        k = bisect.bisect_right(self._firsts, number) - 1
+    def __getitem__(self, index: int) -> dict[str, Any]:  # type: ignore[override]  # one row at a time
+        if not 0 <= index < len(self):
+            raise IndexError(f"row {index} does not exist: the table has {len(self)} rows")
+        k = bisect.bisect_right(self._starts, index) - 1
         with self._lock:
             group = self._group(k)
         with arrow_errors(self._path):
-            return group.slice(number - self._firsts[k], 1).to_pylist()[0]
+            return group.slice(index - self._starts[k], 1).to_pylist()[0]

@@ -40,30 +40,28 @@ MOST_KEPT_BYTES = 64 << 20  # of all freed arrays together
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One unit of work. `item_id` is unique within the stage and stable between runs.
+    """One unit of work."""
 
-    num_steps: The number of steps, such as frames, that the work reports with `advance`; None if it is unknown.
-    """
-
-    item_id: str
+    item_id: str  # unique within the stage and stable between runs
     payload: Any = None
-    num_steps: int | None = None
+    num_steps: int | None = None  # steps, such as frames, that the work reports with `advance`; None if unknown
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of an item that did not fail: `result` is JSON-able, `drop_reason` is None for a kept item."""
+    """The outcome of an item that did not fail."""
 
-    result: dict = field(default_factory=dict)
-    drop_reason: str | None = None
+    result: dict = field(default_factory=dict)  # JSON-able
+    drop_reason: str | None = None  # None for a kept item
 
 
 Work = Callable[[Item], Outcome]
 Start = Callable[[], Work]  # the first message to a worker: a partial of a module-level function
 
+# The state of this process, which works on one item at a time. `attempt` and `_Sender.begin` set it for each item.
 _worker_index = 0
-_on_steps: Callable[[int], None] | None = None
-_num_steps = 0
+_num_steps = 0  # finished steps of the current item
+_on_steps: Callable[[int], None] | None = None  # called with `_num_steps` when it changes
 
 
 def worker_index() -> int:
@@ -110,10 +108,10 @@ def attempt(work: Work, item: Item, on_steps: Callable[[int], None] | None = Non
 
 @dataclass(frozen=True)
 class Heartbeat:
-    """A sign that the process is alive. num_steps: finished steps of the item; item_id: None before the first item."""
+    """A sign that the process is alive."""
 
-    item_id: str | None
-    num_steps: int
+    item_id: str | None  # None before the first item
+    num_steps: int  # finished steps of the item
 
 
 # An Exception ends the stage: a fatal error, or the worker could not be made.
@@ -127,18 +125,14 @@ def work_through(connection: Connection, parent_pid: int, heartbeat_s: float, lo
     """Receive a Start, then work on items until None comes; send records, heartbeats and log lines back."""
     global _worker_index
     end_with_parent(parent_pid)
-    for number in LEFT_TO_THE_PARENT:
-        signal.signal(number, signal.SIG_IGN)
+    for signal_number in LEFT_TO_THE_PARENT:
+        signal.signal(signal_number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_THE_PARENT)
     sender = _Sender(connection)
     logging.getLogger().handlers = [sender]
     set_levels(log_level)
     _worker_index = index
-    with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library
-        # The arrays of a frame have megabytes each. Pages that glibc returned to the system are cleared on reuse.
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(MMAP_THRESHOLD, GREATEST_KEPT_BYTES)
-        mallopt(TRIM_THRESHOLD, MOST_KEPT_BYTES)
+    _keep_freed_memory()
     threading.Thread(target=sender.send_heartbeats, args=(heartbeat_s,), daemon=True).start()
     try:
         start: Start | None = _received(connection)
@@ -207,11 +201,9 @@ class LocalTransport:
     """Starts a worker process of this machine, which runs `work_through`, and exchanges messages with it by a pipe.
 
     `ray_engine.RayTransport` has the same methods for a process on a node of a cluster.
-
-    pid: The id of the process; None until it has started. node: The name of its machine; None: this machine.
     """
 
-    node: str | None = None
+    node: str | None = None  # the name of the process's machine; None: this machine
 
     def __init__(self, heartbeat_s: float, log_level: int, worker_index: int) -> None:
         context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
@@ -227,7 +219,7 @@ class LocalTransport:
             # The worker ignores the SIGTERM that Python sends at its exit.
             atexit.register(self._process.kill)
         worker_connection.close()
-        self.pid: int | None = self._process.pid
+        self.pid: int | None = self._process.pid  # None until it has started
 
     def send(self, message: Start | Item | None) -> None:
         """Send a message: first the Start, then one item at a time, finally None. May block."""
@@ -277,6 +269,14 @@ def signals_held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
         for received_number in received:
             signal.raise_signal(received_number)
+
+
+def _keep_freed_memory() -> None:
+    """Let glibc keep freed arrays for reuse: those of a frame have megabytes, and pages of the system are cleared."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(MMAP_THRESHOLD, GREATEST_KEPT_BYTES)
+        mallopt(TRIM_THRESHOLD, MOST_KEPT_BYTES)
 
 
 def return_freed_memory() -> None:

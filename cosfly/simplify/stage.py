@@ -29,29 +29,30 @@ def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
     from.
     """
     grid = empty_grid(raw)
-    before, after = (occupancy(m, like=grid) for m in (raw, simplified))
-    was_occupied, is_occupied = before.occupied, after.occupied
+    raw_grid = occupancy(raw, like=grid)
+    simplified_grid = occupancy(simplified, like=grid)
+    was_occupied, is_occupied = raw_grid.occupied, simplified_grid.occupied
     masks = {
         "free_in_both": ~was_occupied & ~is_occupied,
         "occupied_in_both": was_occupied & is_occupied,
         "raw_alone": was_occupied & ~is_occupied,
         "simplified_alone": is_occupied & ~was_occupied,
     }
-    counts = {name: int(mask.sum()) for name, mask in masks.items()}
-    num_alike, num_either = (
-        counts["free_in_both"] + counts["occupied_in_both"],
-        was_occupied.size - counts["free_in_both"],
-    )
-    facts: dict = {
-        "cells": list(grid.size), "cell_agreement": round(num_alike / was_occupied.size, 4),
-        "iou": round(counts["occupied_in_both"] / num_either, 4) if num_either else 1.0, "agreement": counts,
-    }  # fmt: skip
     for kind in ("Vegetation", "Buildings"):
         is_under = np.zeros_like(was_occupied)
         for box_map in (raw, simplified):
             is_under |= occupancy(box_map.select(box_map.kinds == KINDS[kind]), like=grid).occupied
-        counts[f"differ_under_{kind}"] = int(((was_occupied != is_occupied) & is_under).sum())
-    for name, grid_of_map in (("raw", before), ("simplified", after)):
+        masks[f"differ_under_{kind}"] = (was_occupied != is_occupied) & is_under
+    counts = {name: int(mask.sum()) for name, mask in masks.items()}
+    num_alike = counts["free_in_both"] + counts["occupied_in_both"]
+    num_either = was_occupied.size - counts["free_in_both"]
+    facts: dict = {
+        "cells": list(grid.size),
+        "cell_agreement": round(num_alike / was_occupied.size, 4),
+        "iou": round(counts["occupied_in_both"] / num_either, 4) if num_either else 1.0,
+        "agreement": counts,
+    }
+    for name, grid_of_map in (("raw", raw_grid), ("simplified", simplified_grid)):
         _, sizes = connected_parts(~inflate(grid_of_map, SAFETY_RADIUS_M).occupied, 8)
         cell_m2 = grid.resolution_m**2
         facts[f"{name}_walkable_m2"] = round(float(sizes.sum()) * cell_m2, 1)
@@ -61,14 +62,30 @@ def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
 
 def report(raw: BoxMap, result: BoxMap) -> dict:
     """Return the content of `simplify_report.json`."""
-    passes = [(one.name, one.counts) for one in result.header.passes]
     obstacles = {"raw": int(blocks_walking(raw).sum()), "simplified": int(blocks_walking(result).sum())}
     return {
-        **REPORT_FORMAT.header, "name": raw.name, "num_boxes": {"raw": len(raw), "simplified": len(result)},
+        **REPORT_FORMAT.header,
+        "name": raw.name,
+        "num_boxes": {"raw": len(raw), "simplified": len(result)},
         "obstacles_at_walking_height": obstacles,
-        "passes": [{"pass": name, "num_boxes": sum(counts.values()), "counts": counts} for name, counts in passes],
+        "passes": [
+            {"pass": done.name, "num_boxes": sum(done.counts.values()), "counts": done.counts}
+            for done in result.header.passes
+        ],
         "grid": cross_validate(raw, result),
-    }  # fmt: skip
+    }
+
+
+def _picture(raw: BoxMap, result: BoxMap, grid_facts: dict) -> bytes:
+    """Draw the surfaces and the obstacles at walking height of both maps, side by side, as PNG bytes."""
+    view = TopView.around(np.stack(raw.bounds()), PICTURE_PX)
+    halves = []
+    for title, box_map in (("raw", raw), ("simplified", result)):
+        drawn = box_map.select(box_map.is_any_of(SURFACE_KINDS) | blocks_walking(box_map))
+        area_m2 = grid_facts[f"{title}_walkable_m2"]
+        text = f"{title}: {len(box_map)} boxes, {area_m2:.0f} m2 walkable (drawn: boxes below 2 m)"
+        halves.append(add_caption(draw_map(drawn, view), text))
+    return png_bytes(np.hstack(halves))
 
 
 def run(cfg: SimplifyConfig, maps: Path, out: Path) -> Path:
@@ -80,23 +97,13 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path) -> Path:
     raw = read_boxes(maps)
     result = simplify(raw, cfg)
     if len(result) == 0:
-        raise InputError(
-            "every box of the map lies below the ground",
-            where=maps,
-            expected="boxes above the ground",
-            fix="correct ground_z_m in the header of the map",
-        )
+        what = "every box of the map lies below the ground"
+        fix = "correct ground_z_m in the header of the map"
+        raise InputError(what, where=maps, expected="boxes above the ground", fix=fix)
     write_boxes(product, result)
     facts = report(raw, result)
     write_json(out / "simplify_report.json", facts)
-    view = TopView.around(np.stack(raw.bounds()), PICTURE_PX)
-    halves = []
-    for title, box_map in (("raw", raw), ("simplified", result)):  # obstacles at walking height, side by side
-        shown = box_map.select(box_map.is_any_of(SURFACE_KINDS) | blocks_walking(box_map))
-        area = facts["grid"][f"{title}_walkable_m2"]
-        text = f"{title}: {len(box_map)} boxes, {area:.0f} m2 walkable (drawn: boxes below 2 m)"
-        halves.append(add_caption(draw_map(shown, view), text))
-    write_bytes(out / "simplify.png", png_bytes(np.hstack(halves)))
+    write_bytes(out / "simplify.png", _picture(raw, result, facts["grid"]))
     num_new = len(np.setdiff1d(result.ids, raw.ids))
     log.info("%d boxes became %d, of which %d are stems and pieces of trees", len(raw), len(result), num_new)
     tally = Tally(input=1, kept=1)

@@ -5,7 +5,7 @@ Source: app:simworld:step1, the structured high-level plan.
 
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, NamedTuple, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -19,14 +19,23 @@ PATH_M = 4.0  # width of a footpath
 LEAST_INSIDE_M = 30.0  # side of a town without its edges, its river and its widest street
 
 
-class Object(Record):
-    """An object that a prompt can name; objects.yaml explains the fields.
+class ObjectPart(NamedTuple):
+    """One box of an object, m from the middle of its footprint and over the ground."""
 
-    parts: kind, middle x y, size x y, low and high end of each box, m.
-    """
+    kind: str
+    x: float  # middle
+    y: float
+    wide: float  # full size along x
+    deep: float  # full size along y
+    low: float
+    high: float
+
+
+class Object(Record):
+    """An object that a prompt can name; objects.yaml explains the fields."""
 
     name: str
-    parts: tuple[tuple[str, float, float, float, float, float, float], ...] = ()
+    parts: tuple[ObjectPart, ...] = ()
     where: Literal["open", "water", "layout"] = "open"
     words: tuple[str, ...] = ()
     asset: str | None = None
@@ -35,10 +44,9 @@ class Object(Record):
     @property
     def size_m(self) -> tuple[float, float]:
         """Full size of the footprint, centred at its middle."""
-        return (
-            2 * max(abs(x) + wide / 2 for _, x, _, wide, _, _, _ in self.parts),
-            2 * max(abs(y) + deep / 2 for _, _, y, _, deep, _, _ in self.parts),
-        )
+        wide = 2 * max(abs(part.x) + part.wide / 2 for part in self.parts)
+        deep = 2 * max(abs(part.y) + part.deep / 2 for part in self.parts)
+        return wide, deep
 
 
 @cache
@@ -60,6 +68,9 @@ def _objects() -> dict[str, Object]:
 OBJECTS = _objects()
 
 
+Range = tuple[float, float]  # low and high end
+
+
 class NamedObject(Record):
     """An object of the table, and how many of it."""
 
@@ -67,16 +78,22 @@ class NamedObject(Record):
     count: int = Field(1, ge=1, le=500)
 
 
-Range = tuple[float, float]
-
-
 class Buildings(Record):
-    """Buildings of one kind. count: how many; null: as many of them as there is room for."""
+    """Buildings of one kind."""
 
     name: str = Field(description="what they are called, such as warehouse")
-    count: int | None = Field(None, ge=1, le=1000)
+    count: int | None = Field(None, ge=1, le=1000)  # null: as many of them as there is room for
     footprint_m: Range = Field((12.0, 30.0), description="sides of buildings")
     heights_m: Range = Field((8.0, 24.0), description="heights of buildings")
+
+
+FOOTPRINT_LIMITS_M, HEIGHT_LIMITS_M = (6.0, 120.0), (3.0, 450.0)
+
+
+def _check_range(name: str, values: Range, limits: Range) -> None:
+    if not limits[0] <= values[0] <= values[1] <= limits[1]:
+        expected = f"within {limits[0]:g} to {limits[1]:g}, the lower value first"
+        raise ValueError(f"{name} is {values[0]:g} to {values[1]:g}, but must lie {expected}")
 
 
 class WorldPlan(BaseModel):
@@ -116,16 +133,13 @@ class WorldPlan(BaseModel):
 
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
-        limits = {"footprint_m": (6.0, 120.0), "heights_m": (3.0, 450.0), "building_share": (0.0, 0.8)}
-        ranges = [(name, getattr(self, name), limit) for name, limit in limits.items()]
-        ranges.append(("trees_per_ha", self.trees_per_ha, (0.0, 400.0)))
-        for group in self.buildings:
-            ranges += [(f"{name} of {group.name}", getattr(group, name), limits[name]) for name in list(limits)[:2]]
-        for name, (low, high), (least, most) in ranges:
-            if not least <= low <= high <= most:
-                raise ValueError(
-                    f"{name} is {low:g} to {high:g}, but must lie within {least:g} to {most:g}, the lower value first"
-                )
+        _check_range("footprint_m", self.footprint_m, FOOTPRINT_LIMITS_M)
+        _check_range("heights_m", self.heights_m, HEIGHT_LIMITS_M)
+        _check_range("building_share", self.building_share, (0.0, 0.8))
+        _check_range("trees_per_ha", self.trees_per_ha, (0.0, 400.0))
+        for kind in self.buildings:
+            _check_range(f"footprint_m of {kind.name}", kind.footprint_m, FOOTPRINT_LIMITS_M)
+            _check_range(f"heights_m of {kind.name}", kind.heights_m, HEIGHT_LIMITS_M)
         if self.size_m and not 80.0 <= min(self.size_m) <= max(self.size_m) <= 2000.0:
             raise ValueError(f"size_m is {self.size_m[0]:g} x {self.size_m[1]:g}, but must lie within 80 to 2000 m")
         edges_m = 2 * VERGE_M + max(self.avenue_m, self.street_m) + self.river_m
@@ -139,7 +153,9 @@ class WorldPlan(BaseModel):
         ordinary = Buildings(name="building", footprint_m=self.footprint_m, heights_m=self.heights_m)
         fill = [group for group in self.buildings if group.count is None]
         counted = [group for group in self.buildings if group.count is not None]
-        return counted + (fill or ([] if self.only_these and counted else [ordinary]))
+        if not fill and not (self.only_these and counted):
+            fill = [ordinary]
+        return counted + fill
 
     def known_objects(self) -> list[tuple[Object, int]]:
         """Return the named objects of the table with their counts, summed over equal names."""

@@ -27,16 +27,19 @@ def _longest_first(words: Iterable[str]) -> list[str]:
 
 
 WORDS = read_yaml(Path(__file__).with_name("words.yaml"))
-STOPS, ORDINARY = set(_words(WORDS["stops"])), set(_words(WORDS["ordinary"]))
+STOPS = set(_words(WORDS["stops"]))
+ORDINARY = set(_words(WORDS["ordinary"]))
 FIELD_BOUNDS = {"gap_m": (0.5, 40.0), "street_m": (5.0, 40.0), "avenue_m": (5.0, 60.0), "parked_share": (0.0, 0.9)}
 SEVERAL, SEVERAL_OPEN = 4, 3  # objects, and open blocks, of a plural without a number
 STOREY_M = 3.2
+VARIED = {"blocks_along": (0.92, 1.08), "block_m": (0.85, 1.2), "gap_m": (0.92, 1.08)}  # range of random factors
 LOWEST_M, HIGHEST_M = 3.0, 450.0  # buildings of a plan
 LOW_TOWN_M = 16.0  # highest building of a town without high-rises
 LINEAR_DEPTH = 2.4  # depth of a linear town of a given length, in blocks
 
 # Patterns of the text, which is in lower case with numbers in digits, each with an example.
-_NUMBER, _LENGTH = r"(\d+(?:\.\d+)?)", r"(km|kilomet(?:er|re)s?|m|metres?|meters?)\b"
+_NUMBER = r"(\d+(?:\.\d+)?)"
+_LENGTH = r"(km|kilomet(?:er|re)s?|m|metres?|meters?)\b"
 _HEIGHT = (  # "12 m", "3-storey", but not the "12 m" of "12 m wide"
     rf"(?P<number>{_NUMBER})[ -]?(?P<unit>m|metres?|meters?|floors?|storeys?|stor(?:y|ies)|levels?)\b"
     r"(?! (?:wide|long|x|by))(?: high| tall| in height)?"
@@ -76,34 +79,47 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
     return _Reader(prompt).read(seed)
 
 
+def _normalized(prompt: str) -> str:
+    """Return a prompt in lower case with numbers in digits, and with one word for phrases such as "few trees"."""
+    text = prompt.lower().replace("’", "'")
+    for word in _longest_first(WORDS["numbers"]):
+        text = re.sub(rf"\b{word}\b", str(WORDS["numbers"][word]), text)
+    for plain, pattern in (("1-stor", r"\bsingle[- ]stor"), ("hotel-buildings", r"(?<!\d )\bhotels\b")):
+        text = re.sub(pattern, plain, text)
+    text = re.sub(r"\b([2-9]0)[- ]([1-9])\b", lambda match: str(int(match[1]) + int(match[2])), text)  # "20-5": 25
+    for words in _longest_first(WORDS["amounts"]):
+        amount = WORDS["amounts"][words]  # "hardly any greenery" becomes the word "few-trees" of the choices
+        text = re.sub(rf"\b{words} (?:trees|vegetation|greenery)\b", f"{amount}-trees", text)
+        text = re.sub(rf"\b{words} cars\b", f"{amount}-cars", text)
+    return f" {text} "
+
+
 class _Reader:
-    """Reads one prompt. text: what is not read yet; plan: the fields of the plan so far."""
+    """Reads one prompt."""
 
     def __init__(self, prompt: str) -> None:
-        self.prompt = prompt
-        self.plan: dict[str, Any] = WorldPlan().model_dump()
-        self.not_used: list[str] = []
-        self.not_respected: list[str] = []
-        self.absent = ""
-        text = prompt.lower().replace("’", "'")
-        if re.search(r"[\u4e00-\u9fff]", text):
-            what, expected = "内置规则只读英文描述", "英文描述, 例如 'a small village with a church'"
+        if re.search(r"[\u4e00-\u9fff]", prompt):
+            what = "内置规则只读英文描述"
+            expected = "英文描述, 例如 'a small village with a church'"
             fix = "用英文写这段描述, 或用 --planner URL 指定语言模型"
             raise InputError(what, where="PROMPT", got=repr(prompt[:60]), expected=expected, fix=fix)
-        for word in _longest_first(WORDS["numbers"]):
-            text = re.sub(rf"\b{word}\b", str(WORDS["numbers"][word]), text)
-        for plain, pattern in (("1-stor", r"\bsingle[- ]stor"), ("hotel-buildings", r"(?<!\d )\bhotels\b")):
-            text = re.sub(pattern, plain, text)
-        text = re.sub(r"\b([2-9]0)[- ]([1-9])\b", lambda match: str(int(match[1]) + int(match[2])), text)  # "20-5": 25
-        for words in _longest_first(WORDS["amounts"]):
-            amount = WORDS["amounts"][words]  # "hardly any greenery" becomes the word "few-trees" of the choices
-            text = re.sub(rf"\b{words} (?:trees|vegetation|greenery)\b", f"{amount}-trees", text)
-            text = re.sub(rf"\b{words} cars\b", f"{amount}-cars", text)
-        self.text = f" {text} "
+        self.prompt = prompt
+        self.text = _normalized(prompt)  # what is not read yet
+        self.plan: dict[str, Any] = WorldPlan().model_dump()  # its fields so far
+        self.not_used: list[str] = []
+        self.not_respected: list[str] = []
+        # What is read by `_take_phrases`.
+        self.sizes: dict[str, re.Match[str]] = {}  # of the town, by name in _SIZES
+        self.heights: dict[str, re.Match[str]] = {}  # of buildings, by name in _HEIGHTS
+        self.absent = ""  # what there is not, such as "towers "
+        self.objects: dict[str, int] = {}  # counts
+        self.buildings: dict[str, int | None] = {}  # counts by kind; None for a plural without a number
+        self.pattern: str | None = None  # of streets, if it is named
+        self.named: str | None = None  # the settlement, if it is named
 
     def read(self, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
         """Return the plan and the trace."""
-        text = self.text
+        whole_text = self.text
         self._take_phrases()
         implied = [WORDS["buildings"][name].get("implies") for name, count in self.buildings.items() if count != 1]
         place = self.named or next(filter(None, implied), "town")
@@ -114,13 +130,13 @@ class _Reader:
         towns = [WORDS["settlements"][name]["words"] for name in (place, "city", "town")]
         for words in (*towns, WORDS["patterns"].get(self.pattern, "")):
             self._take_words(words)
-        if self.text == text and not self.absent:
+        if self.text == whole_text and not self.absent:
             self._refuse()
         self.plan["pattern"] = self.pattern or settlement["patterns"][seed % len(settlement["patterns"])]
         self._set_buildings(settlement, choices, has_open)
         # The seed varies what settlement and choices set; then comes what the prompt measures, which does not vary.
-        for name, low, high in (("blocks_along", 0.92, 1.08), ("block_m", 0.85, 1.2), ("gap_m", 0.92, 1.08)):
-            self.plan[name] = _scaled(self.plan[name], rng_for(seed, "world", name).uniform(low, high))
+        for name, factors in VARIED.items():
+            self.plan[name] = _scaled(self.plan[name], rng_for(seed, "world", name).uniform(*factors))
         self._set_heights()
         self._set_size()
         if re.search(r"\b(?:vehicles?|traffic)\b", self.absent):
@@ -156,6 +172,11 @@ class _Reader:
             self.text = f"{self.text[: match.start()]} {match.expand(keep)} {self.text[match.end() :]}"
         return match
 
+    def _take_named(self, patterns: dict[str, str]) -> dict[str, re.Match[str]]:
+        """Take the first match of each pattern; return the matches by the names of the patterns."""
+        matches = {name: self._take(pattern) for name, pattern in patterns.items()}
+        return {name: match for name, match in matches.items() if match is not None}
+
     def _take_words(self, words: str) -> None:
         """Take all of some words, singular or plural."""
         for word in _longest_first(_words(words)):
@@ -163,22 +184,31 @@ class _Reader:
                 pass
 
     def _take_counted(self, word: str, plural_count: int, *, needs_number: bool = False) -> int | None:
-        """Take a noun, not its adjectives; return its number. Without one it is 1, or in the plural `plural_count`."""
+        """Take a noun, not its adjectives; return its number, or None if the text does not hold it.
+
+        A noun without a number counts 1, or `plural_count` in the plural.
+        """
         plural = f"{word[:-1]}ies" if re.search("[^aeiou]y$", word) else f"{word}(?:e?s)?"
         adjectives = rf"(?:(?!(?:{_STOPS}) )[a-z-]+ ){{0,3}}?"
         number = rf"(?:\b(\d+) ({adjectives})){'' if needs_number else '?'}"
         # "3 tall brick towers": number "3", adjectives "tall brick ", noun "towers"
         match = self._take(rf"{number}\b({word}|{plural})\b(?!-)", keep=r", \2 ,")
-        return match and (int(match[1] or 0) or (1 if match[3] == word else plural_count))
+        if match is None:
+            return None
+        count = int(match[1] or 0)
+        if count:
+            return count
+        return 1 if match[3] == word else plural_count
 
     def _take_phrases(self) -> None:
         """Take measures and nouns. Each is taken before those that would misread it."""
         # Measures are before nouns, which their numbers do not count.
-        self.sizes = {name: match for name, pattern in _SIZES.items() if (match := self._take(pattern))}
+        self.sizes = self._take_named(_SIZES)
         while match := self._take(_WIDTH, keep=r"\1 ,"):  # before heights and the word "wide", which would misread it
             self.not_used.append(match[0].strip())
-        self.heights = {name: match for name, pattern in _HEIGHTS.items() if (match := self._take(pattern))}
-        for name in [name for name in self.heights if name != "at_least"][1:]:  # highest ones after the first
+        self.heights = self._take_named(_HEIGHTS)
+        limits = [name for name in self.heights if name != "at_least"]
+        for name in limits[1:]:  # only the first limits the highest building
             self.not_used.append(self.heights.pop(name)[0].strip())
         while match := self._take(_ABSENT):  # before the nouns: "without towers" names no tower
             self.absent += f"{match[1]} "
@@ -197,8 +227,9 @@ class _Reader:
         counts: dict[str, int] = {}
         names = {word: thing.name for thing in OBJECTS.values() for word in (thing.name, *thing.words)}
         for word in _longest_first(names):
+            name = names[word]
             while (count := self._take_counted(word, SEVERAL)) is not None:
-                counts[names[word]] = self._within(f"number of {names[word]}s", count, 1, 500)
+                counts[name] = self._within(f"number of {name}s", count, 1, 500)
         return dict(sorted(counts.items()))
 
     def _take_buildings(self) -> dict[str, int | None]:
@@ -221,10 +252,11 @@ class _Reader:
         about_settlement = [phrase for phrase in phrases if re.search(settlement, phrase)]
         for group, rows in WORDS["groups"].items():
             text = " , ".join(about_settlement if group == "size" else phrases)
-            word_of = {
-                choice: word for choice, row in rows.items() for word in _words(row["words"])
-                if re.search(rf"(?<![\w-]){word}(?![\w-])", text)
-            }  # fmt: skip
+            word_of: dict[str, str] = {}  # the last word of each choice in the text
+            for choice, row in rows.items():
+                for word in _words(row["words"]):
+                    if re.search(rf"(?<![\w-]){word}(?![\w-])", text):
+                        word_of[choice] = word
             if len(word_of) > 1:
                 got = " and ".join(repr(word) for word in word_of.values())
                 what = f"two words about {group} contradict each other"
@@ -233,13 +265,14 @@ class _Reader:
                 choices[group] = choice
                 self._take_words(rows[choice]["words"])
         for group, choice in choices.items():
-            factors = WORDS["groups"][group][choice]
-            self.plan |= {name: _scaled(self.plan[name], factor) for name, factor in factors.items() if name != "words"}
+            for name, factor in WORDS["groups"][group][choice].items():
+                if name != "words":
+                    self.plan[name] = _scaled(self.plan[name], factor)
         return choices
 
     def _take_open_and_water(self) -> bool:
         """Take words of open blocks and of water, and set both; return whether open blocks are named."""
-        text = self.text
+        text_before = self.text
         for word, (field, width_m) in WORDS["water"].items():
             if self._has(word):
                 self.plan[field] = width_m
@@ -249,7 +282,7 @@ class _Reader:
             if count is not None:
                 most = 20 if field == "plazas" else 40  # as in WorldPlan
                 self.plan[field] = max(self.plan[field], self._within(f"number of {word}s", count, 1, most))
-        has_open = self.text != text
+        has_open = self.text != text_before
         self._take_words(",".join(WORDS["water"]))
         if "bridge" in self.objects:
             self.plan["bridges"] = self._within("number of bridges", self.objects["bridge"], 1, 10)
@@ -324,9 +357,9 @@ class _Reader:
         """Set the size of the town to that of the prompt."""
         pitch_m = self.plan["block_m"] + self.plan["street_m"]
         for name, match in self.sizes.items():
-            if name == "sides":
-                unit_m = _metres(match[4])  # of both sides in "600 x 400 m"
-                sides_m = float(match[1]) * (_metres(match[2]) if match[2] else unit_m), float(match[3]) * unit_m
+            if name == "sides":  # in "600 x 400 m" the unit is that of both
+                width_m = float(match[1]) * _metres(match[2] or match[4])
+                sides_m = (width_m, float(match[3]) * _metres(match[4]))
             elif name == "area":
                 unit_m2 = 1e6 if "k" in match[2] else 1e4 if match[2].startswith("h") else 1.0
                 sides_m = (math.sqrt(float(match[1]) * unit_m2),) * 2
@@ -362,8 +395,10 @@ def _limited(heights_m: Any, low_m: float, high_m: float | None, *, is_replaced:
 
 
 def _metres(unit: str) -> float:
-    return 1000.0 if unit.startswith("k") else 1.0 if unit.startswith("m") else STOREY_M
+    """Return the metres in a unit: kilometres, metres, or storeys under any name."""
+    return {"k": 1000.0, "m": 1.0}.get(unit[0], STOREY_M)
 
 
 def _scaled(value: Any, factor: float) -> Any:
+    """Return a number, or each number of a range, times a factor."""
     return tuple(round(v * factor, 2) for v in value) if isinstance(value, tuple | list) else round(value * factor, 2)

@@ -5,7 +5,7 @@ import logging
 import re
 from collections import Counter
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypedDict
 
 import numpy as np
 import shapely
@@ -35,11 +35,21 @@ WORLD_FILE, SIZES_FILE, LOOP_FILE = "combined_world.json", "Bbox.json", "loop.ya
 CHECKS_FORMAT = FileFormat("cosfly.world_checks", "1.0", "checks of a world")
 CREDITS = "cosfly; sizes of assets by SimWorld, maitrix-org and contributors"
 MOST_CHARACTERS = 2000  # of a prompt
-
+PICTURE_PX = 1000  # longer side of the picture
 ROAD_COST = 20  # a metre of carriageway away from crossings costs as much as 20 m of pavement
+
+TASK = """You plan a town for a generator that lays out streets, blocks and buildings. The user describes the town.
+Answer with one JSON object and nothing else. It has these fields, each of them optional:
+{fields}
+In `objects`, list once, with its count, everything that the user names and this table holds: {objects}.
+In `buildings`, list the kinds of buildings that the user names, with their number if it is said.
+Words of the user that no field holds go into `not_used`.
+Choose ranges wide enough that a random town meets them, and as narrow as the user's description."""
 
 
 class PlannerEndpointConfig(EndpointConfig):
+    """Sampling of a planner, whose answers are longer."""
+
     own_names: ClassVar[dict[str, str]] = {"caption.endpoint": "world.endpoint"}
     max_tokens: int = Field(2048, ge=64, description="longest plan, tokens")
 
@@ -55,57 +65,65 @@ class WorldConfig(Config):
     endpoint: PlannerEndpointConfig = Field(PlannerEndpointConfig(), description="requests to the language model")
 
 
-def check_world(town: Town, plan: WorldPlan) -> list[dict[str, Any]]:
-    """Return each check of a world: its name, the measured value, the accepted range, and whether it is met."""
+class WorldCheck(TypedDict):
+    """A check of a world, as in `checks.json`."""
+
+    check: str
+    got: float
+    least: float
+    most: float
+    is_met: bool
+
+
+def _check(name: str, got: float, least: float, most: float) -> WorldCheck:
+    is_met = bool(least - 1e-6 <= got <= most + 1e-6)
+    return {"check": name, "got": round(float(got), 4), "least": least, "most": most, "is_met": is_met}
+
+
+def check_world(town: Town, plan: WorldPlan) -> list[WorldCheck]:
+    """Compare a world with the ranges of its plan."""
     world = town.boxes
-    houses, buildings = (one.select(of_kinds(one, "Buildings")) for one in (town.layout, world))
+    houses = town.layout.select(of_kinds(town.layout, "Buildings"))
+    buildings = world.select(of_kinds(world, "Buildings"))  # also those of objects
     kinds = plan.kinds_of_buildings()
-    low, high = min(kind.heights_m[0] for kind in kinds), max(kind.heights_m[1] for kind in kinds)
+    low = min(kind.heights_m[0] for kind in kinds)
+    high = max(kind.heights_m[1] for kind in kinds)
     heights_m = houses.maxs[:, 2] if len(houses) else [low]
     checks = [
-        ("building share", shapely.area(footprints(houses)).sum() / town.land_m2, *plan.building_share),
-        ("lowest building, m", min(heights_m), low, high),
-        ("highest building, m", max(heights_m), low, high),
-        ("trees per hectare", trees_of(world).sum() / town.land_m2 * 1e4, *plan.trees_per_ha),
+        _check("building share", shapely.area(footprints(houses)).sum() / town.land_m2, *plan.building_share),
+        _check("lowest building, m", min(heights_m), low, high),
+        _check("highest building, m", max(heights_m), low, high),
+        _check("trees per hectare", trees_of(world).sum() / town.land_m2 * 1e4, *plan.trees_per_ha),
     ]
     for kind in kinds:
         if kind.count is not None:
-            checks.append((f"number of {kind.name}s", town.built[kind.name], 0.9 * kind.count, 1.1 * kind.count))
-    num_open = plan.plazas + plan.greens
-    checks.append(("plazas and green blocks", len(town.open_blocks), num_open, max(num_open, len(town.open_blocks))))
+            checks.append(_check(f"number of {kind.name}s", town.built[kind.name], 0.9 * kind.count, 1.1 * kind.count))
+    num_planned, num_open = plan.plazas + plan.greens, len(town.open_blocks)
+    checks.append(_check("plazas and green blocks", num_open, num_planned, max(num_planned, num_open)))
     if plan.highest_m is not None:
-        checks.append(("highest building or object, m", buildings.maxs[:, 2].max(initial=0.0), 0.0, plan.highest_m))
-    return [
-        {"check": name, "got": round(float(got), 4), "least": least, "most": most,
-         "is_met": bool(least - 1e-6 <= got <= most + 1e-6)}
-        for name, got, least, most in checks
-    ]  # fmt: skip
+        highest_m = buildings.maxs[:, 2].max(initial=0.0)
+        checks.append(_check("highest building or object, m", highest_m, 0.0, plan.highest_m))
+    return checks
 
 
-def _problems(checks: list[dict[str, Any]], town: Town, trace: dict[str, Any]) -> str:
+def _problems(checks: list[WorldCheck], town: Town, trace: dict[str, Any]) -> str:
     """Return one line that names what of a prompt the world does not respect; empty where it respects all."""
-    unmet = ["{check} ({got:g}, expected {least:g} to {most:g})".format(**one) for one in checks if not one["is_met"]]
+    unmet = [
+        f"{check['check']} ({check['got']:g}, expected {check['least']:g} to {check['most']:g})"
+        for check in checks if not check["is_met"]
+    ]  # fmt: skip
     missing = Counter(f"{name} ({reason})" for name, reason in town.not_placed)
     numbers = [phrase for phrase in trace["not_used"] if re.match(r"\d+ \(of ", phrase)]
     lists = {
         "not respected": trace.get("not_respected", []) + unmet,
-        "not placed": [f"{number} x {name}" if number > 1 else name for name, number in missing.items()],
+        "not placed": [f"{count} x {name}" if count > 1 else name for name, count in missing.items()],
         "words not used": [phrase for phrase in trace["not_used"] if phrase not in numbers],
         "numbers not used": numbers,
     }
-    parts = [f"{title}: {', '.join(names)}" for title, names in lists.items() if names]
+    parts = [f"{title}: {', '.join(phrases)}" for title, phrases in lists.items() if phrases]
     if not trace.get("settlement_is_named", True):
         parts.insert(0, f"no kind of place that the generator has is named, so this is a {trace['settlement']}")
     return "; ".join(parts)
-
-
-TASK = """You plan a town for a generator that lays out streets, blocks and buildings. The user describes the town.
-Answer with one JSON object and nothing else. It has these fields, each of them optional:
-{fields}
-In `objects`, list once, with its count, everything that the user names and this table holds: {objects}.
-In `buildings`, list the kinds of buildings that the user names, with their number if it is said.
-Words of the user that no field holds go into `not_used`.
-Choose ranges wide enough that a random town meets them, and as narrow as the user's description."""
 
 
 def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tuple[WorldPlan, dict[str, Any]]:
@@ -159,27 +177,19 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     product = out / WORLD_FILE
     if stage.is_complete:
         return product
-    by_model = plan_by_model(cfg, prompt, seed, out.parent / "answers") if cfg.planner else None
-    plan, trace = by_model or plan_by_rules(prompt, seed)
+    if cfg.planner:
+        plan, trace = plan_by_model(cfg, prompt, seed, out.parent / "answers")
+    else:
+        plan, trace = plan_by_rules(prompt, seed)
     write_json(out / "trace.json", {"prompt": prompt, **trace})
     write_model(out / "plan.json", plan, PLAN_FORMAT)
     town = build(plan, cfg.name, seed)
     _write_world(town, out)
     checks = check_world(town, plan)
-    said = {"not_respected": trace.get("not_respected", []), "words_not_used": plan.not_used}
-    write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks, **said})
-    view = TopView.around(np.stack(town.boxes.bounds()), 1000)
-    picture = draw_map(town.boxes, view)
-    for number, block in enumerate(town.open_blocks):  # plazas first; their pavement is that of other blocks
-        name = "plaza" if number < plan.plazas else "green"
-        draw_text(picture, name, *view.pixels(np.array(block.centroid.coords))[0], align=0.5, halo=HALO)
-    write_bytes(out / "map.png", png_bytes(picture))
-    settings = read_yaml(shipped("simworld.yaml")) | {"name": "world"}  # those of the appendix, for this world
-    world = {"name": cfg.name, "world": str(product.resolve()), "licence": OUR_LICENCE, "credits": CREDITS}
-    settings["pedestrians"]["road_cost"] = ROAD_COST
-    settings["maps"] = {"source": "simworld", "simworld": world}
-    loop = "# cosfly run THIS_FILE --out DIR\n" + yaml.safe_dump(settings, sort_keys=False)
-    write_bytes(out / LOOP_FILE, loop.encode())
+    unread = {"not_respected": trace.get("not_respected", []), "words_not_used": plan.not_used}
+    write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks, **unread})
+    write_bytes(out / "map.png", _picture(town, plan))
+    _write_settings(cfg.name, product, out / LOOP_FILE)
     if problems := _problems(checks, town, trace):
         log.warning("%s", problems)
     num_kept = 1 + len(town.placed)
@@ -190,6 +200,26 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     stage.finish(outputs, tally, num_boxes=len(town.boxes), is_valid=all(check["is_met"] for check in checks))
     log.info("make a data set of it with: cosfly run %s --out %s", out / LOOP_FILE, out / "run")
     return product
+
+
+def _picture(town: Town, plan: WorldPlan) -> bytes:
+    """Draw a town from above, with names on its open blocks, as PNG bytes."""
+    view = TopView.around(np.stack(town.boxes.bounds()), PICTURE_PX)
+    picture = draw_map(town.boxes, view)
+    for index, block in enumerate(town.open_blocks):  # plazas first; their pavement is that of other blocks
+        name = "plaza" if index < plan.plazas else "green"
+        draw_text(picture, name, *view.pixels(np.array(block.centroid.coords))[0], align=0.5, halo=HALO)
+    return png_bytes(picture)
+
+
+def _write_settings(name: str, world_file: Path, path: Path) -> None:
+    """Write settings for `cosfly run` on a world: those of the paper's appendix."""
+    settings = read_yaml(shipped("simworld.yaml")) | {"name": "world"}
+    world = {"name": name, "world": str(world_file.resolve()), "licence": OUR_LICENCE, "credits": CREDITS}
+    settings["pedestrians"]["road_cost"] = ROAD_COST
+    settings["maps"] = {"source": "simworld", "simworld": world}
+    text = "# cosfly run THIS_FILE --out DIR\n" + yaml.safe_dump(settings, sort_keys=False)
+    write_bytes(path, text.encode())
 
 
 def _write_world(town: Town, out: Path) -> None:

@@ -21,10 +21,22 @@ from cosfly.maps.footprints import Rectangle, cover, polygons_of, rectangle_poly
 from cosfly.maps.town_parts import RAILING_M, WATER_BOTTOM_M, WATER_TOP_M, Plot, add_road_paint, furnish
 from cosfly.worldgen.plan import PATH_M, VERGE_M, Range, WorldPlan
 
+# Streets.
 LANE_M = 9.0  # narrower streets have no carriageway
 WIDE_M = 26.0  # wider streets have wide pavements
 PARALLEL_M = 16.0  # a street that is nearer to a bank or to the promenade all along is dropped
 GRID_M = 0.05  # of the ends of streets
+# Share of the distance between crossings within which the corners of irregular cells are one.
+SAME_CORNER_SHARE = 0.3
+
+# Boxes and furniture.
+GROUND_TOP_M = ROAD_TOP_M - 0.02  # two centimetres: a depth buffer separates them at 300 m
+PIECE_M = 2.0  # smallest rectangles that fill a corner
+BETWEEN_CROSSINGS_M = 70.0
+SHORTEST_M = 12.0  # shorter parts of streets have neither crossings nor furniture
+LANE_EDGE_M = 1.6  # from the front of a lane without carriageway to where its kerb would be
+LEAST_PARKING_M, LEAST_AVENUE_M = 6.0, 14.0  # narrower carriageways have no parked cars, narrower streets no trees
+TREE_SHARE = 0.7  # of places of street trees that are planted
 
 
 class Line(NamedTuple):
@@ -72,11 +84,14 @@ class StraightStreet:
 
 
 class Network(NamedTuple):
-    """Streets, water and bridges of a town. bridges: the streets of `streets` that cross the river."""
+    """Streets and water of a town."""
 
     streets: list[StraightStreet]
     water: BaseGeometry
-    bridges: list[StraightStreet]
+    bridges: list[StraightStreet]  # those of `streets` that cross the water
+
+
+# --- patterns ---------------------------------------------------------------------------------------------------------
 
 
 def _spaced(length_m: float, pitch_m: float, unevenness: float, rng: np.random.Generator) -> np.ndarray:
@@ -88,22 +103,22 @@ def _spaced(length_m: float, pitch_m: float, unevenness: float, rng: np.random.G
 def grid(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Line]:
     """Return streets at right angles; the proportions of blocks, the avenues and the offsets of rows vary."""
     stretch = rng.uniform(0.75, 1.35)
-    pitch_x, pitch_y = plan.block_m * stretch + plan.street_m, plan.block_m / stretch + plan.street_m
-    rows = _spaced(size_m[1], pitch_y, plan.unevenness, rng)
-    columns = _spaced(size_m[0], pitch_x, plan.unevenness, rng)
+    rows = _spaced(size_m[1], plan.block_m / stretch + plan.street_m, plan.unevenness, rng)
+    columns = _spaced(size_m[0], plan.block_m * stretch + plan.street_m, plan.unevenness, rng)
     is_staggered = rng.random() < 0.4
-    avenues = rng.integers(len(rows)), rng.integers(len(columns))
-    lines = [
-        Line(np.array([[columns[0], y], [columns[-1], y]]), plan.avenue_m if k == avenues[0] else plan.street_m)
-        for k, y in enumerate(rows)
-    ]
+    avenue_row = rng.integers(len(rows))
+    avenue_column = rng.integers(len(columns))
+    lines = []
+    for k, y in enumerate(rows):
+        width_m = plan.avenue_m if k == avenue_row else plan.street_m
+        lines.append(Line(np.array([[columns[0], y], [columns[-1], y]]), width_m))
     for band, (low, high) in enumerate(pairwise(rows)):
         shift = (columns[1] - columns[0]) / 2 if is_staggered and band % 2 else 0.0
-        for k, x in enumerate(columns):
+        for k, column in enumerate(columns):
             is_inner = 0 < k < len(columns) - 1
-            at = x - shift if is_inner else x
-            width_m = plan.avenue_m if k == avenues[1] and not is_staggered else plan.street_m
-            lines.append(Line(np.array([[at, low], [at, high]]), width_m))
+            x = column - shift if is_inner else column
+            width_m = plan.avenue_m if k == avenue_column and not is_staggered else plan.street_m
+            lines.append(Line(np.array([[x, low], [x, high]]), width_m))
     return lines
 
 
@@ -116,17 +131,16 @@ def radial(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Lin
     inner = max(plan.block_m / 2, count * (plan.avenue_m + 6.0) / (2 * math.pi)) / half.min()
     num_rings = max(1, math.ceil((1.0 - inner) * half.min() / (plan.block_m + plan.street_m) - 0.3))
     radii = np.linspace(inner, 1.0, num_rings + 1)
-    lines = []
-    for number, radius in enumerate(radii):
+    lines = [Line(_polar(np.append(angles, angles[0]), inner, half), plan.street_m)]  # the inner ring
+    lines += [Line(_polar(angle, [inner, 1.0], half), plan.avenue_m) for angle in angles]
+    for radius in radii[1:]:
         arc_m = 2 * math.pi * radius * half.min() / len(angles)
-        if number and arc_m > 1.7 * (plan.block_m + plan.street_m):  # streets between the avenues, from here outwards
+        if arc_m > 1.7 * (plan.block_m + plan.street_m):  # streets between the others, from this ring outwards
             gaps = np.diff(angles, append=angles[0] + 2 * math.pi)
             between = angles + gaps / 2
-            lines += [Line(_polar(between[k], [radii[number], 1.0], half), plan.street_m) for k in range(len(between))]
+            lines += [Line(_polar(angle, [radius, 1.0], half), plan.street_m) for angle in between]
             angles = np.sort(np.concatenate([angles, between]))
         lines.append(Line(_polar(np.append(angles, angles[0]), radius, half), plan.street_m))
-        if not number:
-            lines += [Line(_polar(angle, [inner, 1.0], half), plan.avenue_m) for angle in angles]
     return lines
 
 
@@ -146,29 +160,48 @@ def winding(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Li
     pitch_m = plan.block_m + inner_m
     half = np.array(size_m) / 2
     counts = np.maximum(2, np.round(np.array(size_m) / pitch_m)).astype(int)
+    corners, num_cells_of_edge = _edges_of_cells(_irregular_cells(counts, half, rng), half, SAME_CORNER_SHARE * pitch_m)
+    lines = []
+    for (a, b), num_cells in num_cells_of_edge.items():
+        across = np.array([[0.0, -1.0], [1.0, 0.0]]) @ (corners[b] - corners[a])
+        bend = (corners[a] + corners[b]) / 2 + across * float(np.clip(rng.normal(0.0, 0.12), -0.2, 0.2))
+        points = np.stack([corners[a], np.clip(bend, -half, half), corners[b]])
+        is_border = num_cells == 1
+        lines.append(Line(points, outer_m if is_border else inner_m))
+    return lines
+
+
+def _irregular_cells(counts: np.ndarray, half: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return Voronoi polygons of jittered points in staggered rows, about counts[0] x counts[1], within the town."""
     x, y = np.meshgrid(*(np.arange(-2, count + 2) for count in counts))
-    seeds = np.stack([x + 0.5 + 0.25 * (2 * (y % 2) - 1), y + 0.5], axis=-1).reshape(-1, 2)  # in staggered rows
-    seeds = (seeds + 0.33 * rng.uniform(-1.0, 1.0, seeds.shape)) * (2 * half / counts) - half
-    cells = shapely.get_parts(shapely.voronoi_polygons(shapely.multipoints(seeds)))
-    cells = cells[shapely.contains(shapely.box(*(-half), *half), shapely.centroid(cells))]
-    corners = list[np.ndarray]()  # those nearer to each other than a share of the pitch are one
-    sides: dict[tuple[int, int], int] = {}  # the number of cells at each edge
+    points = np.stack([x + 0.5 + 0.25 * (2 * (y % 2) - 1), y + 0.5], axis=-1).reshape(-1, 2)
+    points = (points + 0.33 * rng.uniform(-1.0, 1.0, points.shape)) * (2 * half / counts) - half
+    cells = shapely.get_parts(shapely.voronoi_polygons(shapely.multipoints(points)))
+    return cells[shapely.contains(shapely.box(*(-half), *half), shapely.centroid(cells))]
+
+
+def _edges_of_cells(
+    cells: np.ndarray, half: np.ndarray, same_m: float
+) -> tuple[list[np.ndarray], dict[tuple[int, int], int]]:
+    """Return the corners of cells, (2,) m each, and for each edge, a pair of corners, the number of cells at it.
+
+    Corners within `same_m` of each other are one, so that no street is very short.
+    """
+    corners = list[np.ndarray]()
+    num_cells: dict[tuple[int, int], int] = {}
     for cell in cells:
         ring = []
         for point in np.clip(shapely.get_coordinates(cell), -half, half):
             away_m = np.linalg.norm(np.array(corners).reshape(-1, 2) - point, axis=1)
-            near = np.flatnonzero(away_m < 0.3 * pitch_m).tolist()
-            ring.append(near[0] if near else len(corners))
-            corners += [] if near else [point]
+            near = np.flatnonzero(away_m < same_m).tolist()
+            if near:
+                ring.append(near[0])
+            else:
+                ring.append(len(corners))
+                corners.append(point)
         for edge in {(min(ends), max(ends)) for ends in pairwise(ring) if ends[0] != ends[1]}:
-            sides[edge] = sides.get(edge, 0) + 1
-    lines = []
-    for (a, b), num_cells in sides.items():
-        across = np.array([[0.0, -1.0], [1.0, 0.0]]) @ (corners[b] - corners[a])
-        bend = (corners[a] + corners[b]) / 2 + across * float(np.clip(rng.normal(0.0, 0.12), -0.2, 0.2))
-        points = np.stack([corners[a], np.clip(bend, -half, half), corners[b]])
-        lines.append(Line(points, outer_m if num_cells == 1 else inner_m))
-    return lines
+            num_cells[edge] = num_cells.get(edge, 0) + 1
+    return corners, num_cells
 
 
 def linear(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Line]:
@@ -182,9 +215,10 @@ def linear(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Lin
     side = 1.0 if rng.random() < 0.5 else -1.0
     for number, (a, b) in enumerate(pairwise(main)):
         foot = a + (b - a) * rng.uniform(0.35, 0.65)
-        for way in (1.0, -1.0) if plan.river_m or number % 3 == 2 else (side,):
+        signs = (1.0, -1.0) if plan.river_m or number % 3 == 2 else (side,)
+        for sign in signs:
             reach_m = min(depth / 2, pitch_m * rng.uniform(0.9, 1.3))
-            tip = foot + np.array([rng.uniform(-0.2, 0.2) * reach_m, way * reach_m])
+            tip = foot + np.array([rng.uniform(-0.2, 0.2) * reach_m, sign * reach_m])
             lines.append(Line(np.stack([foot, tip]), plan.street_m))
         side = -side
     return lines
@@ -195,47 +229,58 @@ PATTERNS: dict[str, Callable[[WorldPlan, Range, np.random.Generator], list[Line]
 }  # fmt: skip
 
 
+# --- network ----------------------------------------------------------------------------------------------------------
+
+
 def network(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> Network:
     """Return the streets and the water of a town of a size."""
     margin_m = VERGE_M + max(plan.avenue_m, plan.street_m) / 2
     half_x, half_y = size_m[0] / 2, size_m[1] / 2
-    inner = size_m[0] - 2 * margin_m, size_m[1] - 2 * margin_m
-    lines = PATTERNS[plan.pattern](plan, inner, rng)
+    inner_m = size_m[0] - 2 * margin_m, size_m[1] - 2 * margin_m
+    lines = PATTERNS[plan.pattern](plan, inner_m, rng)
+    if not plan.river_m:
+        return Network(straight_streets(lines), Polygon(), [])
     window = shapely.box(margin_m - half_x, -half_y, half_x - margin_m, half_y)
-    water: BaseGeometry = Polygon()
-    bridges: list[Line] = []
-    if plan.river_m:
-        x = np.linspace(-half_x, half_x, 6)
-        sway = min(0.08 * size_m[1], 12.0) * rng.uniform(-1.0, 1.0, len(x))
-        sway[0], sway[-1] = sway[1], sway[-2]
-        river = LineString(np.stack([x, rng.uniform(-0.1, 0.1) * size_m[1] + sway], axis=1))
-        width_m = plan.avenue_m if plan.pattern == "linear" else plan.street_m
-        crossings = shapely.get_coordinates([shapely.intersection(LineString(line.points), river) for line in lines])
-        lines, banks = _with_banks(lines, river, (plan.river_m + width_m) / 2 + 0.3, width_m, window)
-        bridges = _bridges(plan, river, banks, crossings, inner[0])
-        water = shapely.union(water, shapely.buffer(river, plan.river_m / 2, cap_style="flat", join_style="mitre"))
-    streets = straight_streets([*lines, *bridges])
-    crossing = [
-        street for street in streets if bridges and water.contains(shapely.Point(street.at(street.length_m / 2, 0)))
-    ]
-    return Network(streets, water, crossing)
+    river = _river(size_m, rng)
+    width_m = plan.avenue_m if plan.pattern == "linear" else plan.street_m
+    crossings = shapely.get_coordinates([shapely.intersection(LineString(line.points), river) for line in lines])
+    apart_m = (plan.river_m + width_m) / 2 + 0.3
+    banks = _banks(river, apart_m, window)
+    lines = _outside_river(lines, river, apart_m, banks)
+    lines += [Line(np.array(bank.coords), width_m) for bank in banks]
+    lines += _bridges(plan, river, banks, crossings, inner_m[0])
+    # The union sets the order of the corners, on which the boxes of the water depend.
+    water = shapely.union(Polygon(), shapely.buffer(river, plan.river_m / 2, cap_style="flat", join_style="mitre"))
+    streets = straight_streets(lines)
+    bridges = [street for street in streets if water.contains(shapely.Point(street.at(street.length_m / 2, 0)))]
+    return Network(streets, water, bridges)
 
 
-def _with_banks(
-    lines: list[Line], course: LineString, apart_m: float, width_m: float, window: Polygon
-) -> tuple[list[Line], list[LineString]]:
-    """Return lines up to streets along both sides of a water, with these streets; and those of them in the window."""
-    sides = [shapely.intersection(course.offset_curve(side * apart_m), window) for side in (1, -1)]
-    banks = [bank for bank in sides if not bank.is_empty]
-    zone = shapely.buffer(course, apart_m, cap_style="flat")
-    near = shapely.buffer(shapely.union_all(banks), PARALLEL_M)  # streets that lie in it are dropped
-    outside = [
-        Line(np.array(part.coords), line.width_m)
-        for line in lines
-        for part in shapely.get_parts(shapely.difference(LineString(line.points), zone))
-        if part.length > GRID_M and not near.contains(part)
-    ]
-    return [*outside, *(Line(np.array(bank.coords), width_m) for bank in banks)], banks
+def _river(size_m: Range, rng: np.random.Generator) -> LineString:
+    """Return the middle of a river that sways from the west to the east edge of a town, and leaves it straight."""
+    x = np.linspace(-size_m[0] / 2, size_m[0] / 2, 6)
+    sway = min(0.08 * size_m[1], 12.0) * rng.uniform(-1.0, 1.0, len(x))
+    sway[0] = sway[1]
+    sway[-1] = sway[-2]
+    return LineString(np.stack([x, rng.uniform(-0.1, 0.1) * size_m[1] + sway], axis=1))
+
+
+def _banks(river: LineString, apart_m: float, window: Polygon) -> list[LineString]:
+    """Return the middles of the streets along both sides of a river, at a distance from its middle, in a window."""
+    sides = [shapely.intersection(river.offset_curve(side * apart_m), window) for side in (1, -1)]
+    return [bank for bank in sides if not bank.is_empty]
+
+
+def _outside_river(lines: list[Line], river: LineString, apart_m: float, banks: list[LineString]) -> list[Line]:
+    """Return the parts of lines up to the banks; parts that run along a bank within PARALLEL_M are dropped."""
+    zone = shapely.buffer(river, apart_m, cap_style="flat")
+    along_banks = shapely.buffer(shapely.union_all(banks), PARALLEL_M)
+    outside = []
+    for line in lines:
+        for part in shapely.get_parts(shapely.difference(LineString(line.points), zone)):
+            if part.length > GRID_M and not along_banks.contains(part):
+                outside.append(Line(np.array(part.coords), line.width_m))
+    return outside
 
 
 def _bridges(
@@ -248,8 +293,8 @@ def _bridges(
         nearest = crossings[np.abs(crossings[:, 0] - x[:, None]).argmin(axis=1), 0]
         x = np.unique(np.where(np.abs(nearest - x) < 0.3 * length_m / count, nearest, x))
     lines = []
-    for place in x:
-        middle = shapely.intersection(river, LineString([(place, -1e4), (place, 1e4)]))
+    for bridge_x in x:
+        middle = shapely.intersection(river, LineString([(bridge_x, -1e4), (bridge_x, 1e4)]))
         points = [shapely.get_coordinates(shapely.shortest_line(bank, middle))[0] for bank in banks]
         lines.append(Line(np.array(points), plan.street_m))
     return lines
@@ -264,68 +309,76 @@ def straight_streets(lines: list[Line]) -> list[StraightStreet]:
         for start, end in pairwise(shapely.get_coordinates(part)):
             if np.linalg.norm(end - start) < GRID_M:
                 continue
-            of = tree.query(shapely.Point((start + end) / 2), predicate="dwithin", distance=0.05)
-            streets.append(StraightStreet(start, end, max(lines[k].width_m for k in of)))
+            line_indices = tree.query(shapely.Point((start + end) / 2), predicate="dwithin", distance=GRID_M)
+            streets.append(StraightStreet(start, end, max(lines[k].width_m for k in line_indices)))
     return streets
 
 
 # --- boxes ------------------------------------------------------------------------------------------------------------
 
-GROUND_TOP_M = ROAD_TOP_M - 0.02  # two centimetres: a depth buffer separates them at 300 m
-PIECE_M = 2.0  # smallest rectangles that fill a corner
-BETWEEN_CROSSINGS_M = 70.0
-SHORTEST_M = 12.0  # shorter parts of streets have neither crossings nor furniture
-LANE_EDGE_M = 1.6  # from the front of a lane without carriageway to where its kerb would be
-LEAST_PARKING_M, LEAST_AVENUE_M = 6.0, 14.0  # narrower carriageways have no parked cars, narrower streets no trees
-TREE_SHARE = 0.7  # of places of street trees that are planted
 
+def _joints(streets: list[StraightStreet]) -> tuple[np.ndarray, np.ndarray]:
+    """Return, for both ends of each street, the tangent of half the turn and the number of other streets, (n, 2) each.
 
-def _ends(streets: list[StraightStreet]) -> tuple[np.ndarray, np.ndarray]:
-    """Return of both ends of each street the tangent of half the turn, and the number of other streets, (n, 2) each.
-
-    A street that ends there alone has the tangent 0.
+    The turn is that to the street that continues most straight. Half of it times half the width is the length by which
+    both streets are extended, so that their outer edges meet. It is 0 at the end of a single street.
     """
-    places = shapely.points([end for street in streets for end in (street.start, street.end)])
+    ends = shapely.points([end for street in streets for end in (street.start, street.end)])
     away = np.array([sign * street.direction for street in streets for sign in (1.0, -1.0)])
-    one, other = shapely.STRtree(places).query(places, predicate="dwithin", distance=0.01)  # on a grid
-    one, other = one[one != other], other[one != other]
-    straightest = np.full(len(away), -1.0)
-    np.maximum.at(straightest, one, -(away[one] * away[other]).sum(axis=1))
-    counts = np.bincount(one, minlength=len(away))
+    first, second = shapely.STRtree(ends).query(ends, predicate="dwithin", distance=0.01)  # on a grid
+    is_pair = first != second
+    first, second = first[is_pair], second[is_pair]
+    straightest = np.full(len(away), -1.0)  # cosine of the least turn
+    np.maximum.at(straightest, first, -(away[first] * away[second]).sum(axis=1))
+    counts = np.bincount(first, minlength=len(away))
     turns = np.arccos(np.where(counts, straightest, 1.0).clip(0.0, 1.0))
     return np.tan(turns / 2).reshape(-1, 2), counts.reshape(-1, 2)
 
 
 def lay_streets(boxes: BoxList, net: Network, parked_share: float, rng: np.random.Generator) -> list[Polygon]:
     """Add the streets with their furniture, and the water with its bridges; return the streets from front to front."""
-    roads = list[Polygon]()
-    tangents, counts = _ends(net.streets)
-    for street, (low, high) in zip(net.streets, tangents, strict=True):
-        half = street.road_m / 2
-        road = street.rectangle((-half * low, street.length_m + half * high), (-half, half))
-        roads.append(rectangle_polygon(road) if half else Polygon())
-        if half:
-            boxes.add("Roads", road.center, road.size, ROAD_TOP_M - SLAB_M, ROAD_TOP_M, road.yaw_deg)
+    tangents, num_others = _joints(net.streets)
+    roads = _lay_roads(boxes, net.streets, tangents)
     tree = shapely.STRtree(roads)
     strips = list[Polygon]()
-    for number, street in enumerate(net.streets):
-        half, dead_end_m = street.width_m / 2, (street.width_m - street.road_m) / 2  # which pavement closes
-        first, last = np.where(counts[number], half * tangents[number], dead_end_m).tolist()
-        strip = rectangle_polygon(street.rectangle((-first, street.length_m + last), (-half, half)))
-        others = shapely.union_all([roads[k] for k in tree.query(strip, predicate="intersects") if k != number])
-        clear = _clear_of(street, shapely.intersection(strip, others))
-        pave(boxes, shapely.difference(strip, shapely.union(others, roads[number])))
+    bridge_strips = list[Polygon]()
+    for k, street in enumerate(net.streets):
+        half = street.width_m / 2
+        dead_end_m = (street.width_m - street.road_m) / 2  # of pavement, which closes it
+        before_m, after_m = np.where(num_others[k], half * tangents[k], dead_end_m).tolist()
+        strip = rectangle_polygon(street.rectangle((-before_m, street.length_m + after_m), (-half, half)))
+        crossing = shapely.union_all([roads[j] for j in tree.query(strip, predicate="intersects") if j != k])
+        clear = _clear_of(street, shapely.intersection(strip, crossing))
+        pave(boxes, shapely.difference(strip, shapely.union(crossing, roads[k])))
         plot = Plot(boxes.framed(street.start, street.yaw_deg), street.start, street.end, rng)
-        _furnish(plot, street, clear, counts[number] > 1, parked_share if street not in net.bridges else None)
-        for side in (-1, 1) if street in net.bridges else ():
-            railing = (street.length_m / 2, side * (street.width_m - RAILING_M) / 2), (street.length_m, RAILING_M)
-            plot.add("Fences", *railing, -SLAB_M, 1.1)
+        has_crossings = num_others[k] > 1
+        if street in net.bridges:
+            _furnish(plot, street, clear, has_crossings, None)
+            for side in (-1, 1):
+                middle = (street.length_m / 2, side * (street.width_m - RAILING_M) / 2)
+                plot.add("Fences", middle, (street.length_m, RAILING_M), -SLAB_M, 1.1)
+            bridge_strips.append(strip)
+        else:
+            _furnish(plot, street, clear, has_crossings, parked_share)
         strips.append(strip)
-    bridges = [strip for street, strip in zip(net.streets, strips, strict=True) if street in net.bridges]
-    for polygon in polygons_of(shapely.difference(net.water, shapely.union_all(bridges))):
+    for polygon in polygons_of(shapely.difference(net.water, shapely.union_all(bridge_strips))):
         for piece in cover(polygon, min_fill=0.97, min_size_m=PIECE_M, max_size_m=400.0):
             boxes.add("Water", piece.center, piece.size, WATER_BOTTOM_M, WATER_TOP_M, piece.yaw_deg)
     return strips
+
+
+def _lay_roads(boxes: BoxList, streets: list[StraightStreet], tangents: np.ndarray) -> list[Polygon]:
+    """Add the carriageways; return their outlines, empty for a street without one."""
+    outlines = list[Polygon]()
+    for street, (low, high) in zip(streets, tangents, strict=True):
+        half = street.road_m / 2
+        if half:
+            road = street.rectangle((-half * low, street.length_m + half * high), (-half, half))
+            boxes.add("Roads", road.center, road.size, ROAD_TOP_M - SLAB_M, ROAD_TOP_M, road.yaw_deg)
+            outlines.append(rectangle_polygon(road))
+        else:
+            outlines.append(Polygon())
+    return outlines
 
 
 def _clear_of(street: StraightStreet, crossed: BaseGeometry) -> Range:
@@ -341,18 +394,22 @@ def _clear_of(street: StraightStreet, crossed: BaseGeometry) -> Range:
 
 
 def _furnish(
-    plot: Plot, street: StraightStreet, clear: Range, are_crossings: np.ndarray, parked_share: float | None
+    plot: Plot, street: StraightStreet, clear: Range, has_crossings: np.ndarray, parked_share: float | None
 ) -> None:
-    """Add paint to a street, with crossings at junctions and evenly between them, and furniture; None: no furniture."""
+    """Add paint to a street, with crossings at junctions and evenly between them, and furniture.
+
+    has_crossings: (2,) whether there is a crossing at its start and at its end. parked_share: None adds no furniture.
+    """
     low, high = clear
-    edge = street.road_m / 2 or street.width_m / 2 - LANE_EDGE_M
+    edge = street.road_m / 2 if street.road_m else street.width_m / 2 - LANE_EDGE_M
     num_parts = 1 + int(max(0.0, high - low) // BETWEEN_CROSSINGS_M)
     for number, part in enumerate(pairwise(np.linspace(low, high, num_parts + 1).tolist())):
         if part[1] - part[0] < SHORTEST_M:
             continue
         if street.road_m:
-            crossings = number == 0 and are_crossings[0], number < num_parts - 1 or are_crossings[1]
-            add_road_paint(plot, 0, part, (-edge, edge), crossings)
+            at_start = number == 0 and has_crossings[0]  # the next parts begin where the previous has its crossing
+            at_end = number < num_parts - 1 or has_crossings[1]
+            add_road_paint(plot, 0, part, (-edge, edge), (at_start, at_end))
         if parked_share is not None:
             furnish(
                 plot, 0, part, (-edge, edge), has_road=street.road_m > 0,

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
+from shapely import Polygon
 from shapely.affinity import rotate
 from shapely.geometry.base import BaseGeometry
 
@@ -42,18 +43,23 @@ LEAST_BLOCK_M2 = 400.0  # of a plaza or a green block
 GROW = 1.25  # factor of the sides of a town in which objects find no room
 MOST_GROWTH = 5  # times
 LEAST_TOWN_M = 170.0  # side of a town without a size, so that people find a way of 100 m
+WIDEST_BLOCK_M = 150.0  # blocks grow up to this size for a large object
+PATH_HALF_M = 1.5  # half width of a path across a green
+GARDEN_SETBACK_M = 2.5  # houses that stand farther back have gardens, so their blocks are not paved
+HEIGHT_SHAPE = (1.3, 1.7)  # of the beta distribution of heights: few buildings are very low or very high
+TREE_GOAL = 0.35  # place of the number of trees in its range
 
 Size = tuple[float, ...]
 
 
 class Placed(NamedTuple):
-    """One placed object: middle, m; scale of its footprint."""
+    """One placed object."""
 
     name: str
-    number: int
-    xy: tuple[float, float]
+    number: int  # among the objects of the name
+    xy: tuple[float, float]  # middle, m
     yaw_deg: float
-    scale: float
+    scale: float  # of its footprint
 
 
 def of_kinds(box_map: BoxMap, *names: str) -> np.ndarray:
@@ -73,26 +79,33 @@ def build(plan: WorldPlan, name: str, seed: int) -> Town:
     A town without a size is as large as its blocks, or, where all buildings are counted, as these need.
     """
     widest_m = max((max(thing.size_m) * thing.least_scale for thing, _ in plan.known_objects()), default=0.0)
-    plan = plan.model_copy(update={"block_m": max(plan.block_m, min(widest_m + 2 * SPACE_M, 150.0))})
+    plan = plan.model_copy(update={"block_m": max(plan.block_m, min(widest_m + 2 * SPACE_M, WIDEST_BLOCK_M))})
     if plan.size_m:
         return Town(plan, plan.size_m, name, seed)
-    pitch_m = plan.block_m + plan.street_m
-    edges_m = 2 * VERGE_M + plan.avenue_m + plan.river_m
-    side_m = plan.blocks_along * pitch_m + edges_m
-    counted = {kind.name: kind.count for kind in plan.buildings if kind.count}
-    if plan.only_these and counted:
-        fronts_m = sum((one.count or 0) * (sum(one.footprint_m) / 2 + 1.3 * plan.gap_m) for one in plan.buildings)
-        side_m = max(LEAST_TOWN_M, math.sqrt(fronts_m * pitch_m / 3) + edges_m)
+    counts = {kind.name: kind.count for kind in plan.buildings if kind.count}
+    num_requested = sum(counts.values())
+    side_m = _side_m(plan)
     for _ in range(MOST_GROWTH):
         town = Town(plan, _stretched(plan, side_m, seed), name, seed)
-        wanted, num_built = sum(counted.values()), sum(town.built[kind] for kind in counted)
-        if num_built < wanted:
-            side_m *= min(2.0, 1.05 * math.sqrt(wanted / max(1, num_built)))
+        num_built = sum(town.built[kind] for kind in counts)
+        if num_built < num_requested:
+            side_m *= min(2.0, 1.05 * math.sqrt(num_requested / max(1, num_built)))
         elif any(reason == "no room" for _, reason in town.not_placed):
             side_m *= GROW
         else:
             break
     return town
+
+
+def _side_m(plan: WorldPlan) -> float:
+    """Return the first side of a square town without a size."""
+    pitch_m = plan.block_m + plan.street_m
+    edges_m = 2 * VERGE_M + plan.avenue_m + plan.river_m
+    counted = [kind for kind in plan.buildings if kind.count]
+    if not (plan.only_these and counted):
+        return plan.blocks_along * pitch_m + edges_m
+    fronts_m = sum((kind.count or 0) * (sum(kind.footprint_m) / 2 + 1.3 * plan.gap_m) for kind in counted)
+    return max(LEAST_TOWN_M, math.sqrt(fronts_m * pitch_m / 3) + edges_m)
 
 
 def _stretched(plan: WorldPlan, side_m: float, seed: int) -> Range:
@@ -108,38 +121,53 @@ def _footprints(low: float, high: float) -> list[Range]:
     """Return the footprints of SimWorld's buildings in a range; if fewer than four fit, others."""
     sizes = [(size[0], size[1]) for name, size in assets().items() if name.startswith("BP_Building")]
     fitting = [size for size in sizes if low <= min(size) and max(size) <= high]
-    sides = np.linspace(low, high, 6).tolist()
-    return fitting if len(fitting) >= 4 else [(x, max(0.6 * low, x * share)) for x in sides for share in (0.6, 0.9)]
+    if len(fitting) >= 4:
+        return fitting
+    return [(x, max(0.6 * low, x * share)) for x in np.linspace(low, high, 6).tolist() for share in (0.6, 0.9)]
 
 
 class Town:
     """A town of a size: its ground, then objects, buildings and trees on what is left.
 
-    size_m: from west to east and from south to north. layout: streets and buildings. placement: the objects. built:
-    numbers of buildings by kind. not_placed: name of a missing object -> reason, an entry for each.
+    size_m: from west to east and from south to north.
     """
 
     def __init__(self, plan: WorldPlan, size_m: Range, name: str, seed: int) -> None:
-        self.plan, self.size_m, self.name, self.seed = plan, size_m, name, seed
-        self.built = Counter[str]()
+        self.plan = plan
+        self.size_m = size_m
+        self.name = name
+        self.seed = seed
+        self.built = Counter[str]()  # numbers of buildings by kind
         self.placed = list[Placed]()
+        # Names and reasons of missing objects, an entry for each.
         self.not_placed = [(missing, "not in the object table") for missing in plan.unknown_objects()]
         self.object_nodes = list[tuple[str, str | None]]()  # name and asset of each box of `placement`
-        self._boxes, self._objects = BoxList(), BoxList()
+        self._boxes = BoxList()  # streets and buildings
+        self._objects = BoxList()
         self._taken = list[BaseGeometry]()  # outlines of buildings and objects
-        self._lay_ground()
-        self._open_blocks()
+        self._outline = shapely.box(-size_m[0] / 2, -size_m[1] / 2, size_m[0] / 2, size_m[1] / 2)
+        self.network = network(plan, size_m, rng_for(seed, "world", "streets"))
+        self._strips = self._lay_streets()  # outlines of streets, from front to front
+        between_blocks = shapely.union(shapely.union_all(self._strips), self.network.water)
+        self._blocks = shapely.difference(self._outline, between_blocks)
+        self._closed_blocks = self._find_closed_blocks()
+        self._buildable = self._find_buildable()
+        self.open_blocks = self._choose_open_blocks()
+        self._paved = shapely.STRtree([*self._strips, *self._pave_open_blocks()])  # where paths to doors begin
+        self._buildable = shapely.difference(self._buildable, shapely.union_all(self.open_blocks).buffer(0.1))
+        shapely.prepare(self._buildable)
         for thing, count in sorted(plan.known_objects(), key=lambda pair: -math.prod(pair[0].size_m)):
             self._place_object(thing, count)
         self._build_houses()
-        if plan.setback_m < 2.5:
-            for block in self._closed:
+        if plan.setback_m < GARDEN_SETBACK_M:
+            for block in self._closed_blocks:
                 if block.area < 4 * plan.block_m**2 and block not in self.open_blocks:
                     pave(self._boxes, block, BLOCK_PIECE_M)
         source = MapSource(tool="cosfly world", version="3", seed=seed)
         header = MapHeader(name=name, source=source, licence=OUR_LICENCE, ground_z_m=0.0)
-        self.layout, self.placement = self._boxes.box_map(header), self._objects.box_map()
-        self._set_trees(rng_for(seed, "world", "trees"))
+        self.placement = self._objects.box_map()
+        self.layout = self._boxes.box_map(header)
+        self.layout = self._with_trees(rng_for(seed, "world", "trees"))
 
     @property
     def boxes(self) -> BoxMap:
@@ -148,54 +176,59 @@ class Town:
     @property
     def land_m2(self) -> float:
         """The area without the water."""
-        x, y = self.size_m[0] / 2, self.size_m[1] / 2
-        return float(shapely.difference(shapely.box(-x, -y, x, y), self.network.water).area)
+        return float(shapely.difference(self._outline, self.network.water).area)
 
-    def _lay_ground(self) -> None:
-        """Add the ground and the streets, and find the blocks: the ground between streets and water."""
-        plan, boxes = self.plan, self._boxes
-        x, y = self.size_m[0] / 2, self.size_m[1] / 2
-        boxes.span("Terrain", (-x, -y), (x, y), GROUND_TOP_M - SLAB_M, GROUND_TOP_M)
-        self.network = network(plan, self.size_m, rng_for(self.seed, "world", "streets"))
+    # --- the ground ---
+
+    def _lay_streets(self) -> list[Polygon]:
+        """Add the ground and the streets with their furniture; return the outlines of the streets."""
+        low_x, low_y, high_x, high_y = self._outline.bounds
+        self._boxes.span("Terrain", (low_x, low_y), (high_x, high_y), GROUND_TOP_M - SLAB_M, GROUND_TOP_M)
         furniture = rng_for(self.seed, "world", "furniture")
-        self._strips = lay_streets(boxes, self.network, plan.parked_share, furniture)
-        self._paved = shapely.STRtree(self._strips)  # where paths to doors begin
-        strips = shapely.union_all(self._strips)
-        ground = shapely.box(-x, -y, x, y)
-        self._blocks = shapely.difference(ground, shapely.union(strips, self.network.water))
-        self._closed = [
-            block for block in polygons_of(self._blocks)
-            if block.area > LEAST_BLOCK_M2 and ground.boundary.distance(block) > 0.1
-        ]  # fmt: skip
-        self._closed.sort(key=lambda block: block.centroid.distance(shapely.Point(0, 0)))
-        inside = shapely.union_all(self._closed) if plan.pattern == "campus" else self._blocks
-        self._buildable = shapely.intersection(inside, shapely.box(2.0 - x, -y, x - 2.0, y - 2.0))
+        return lay_streets(self._boxes, self.network, self.plan.parked_share, furniture)
 
-    def _open_blocks(self) -> None:
-        """Choose plazas, the nearest to the middle, and greens; pave plazas, and paths across greens."""
+    def _find_closed_blocks(self) -> list[Polygon]:
+        """Return the blocks that do not touch the edge of the town, the nearest to its middle first."""
+        edge = self._outline.boundary
+        blocks = [block for block in polygons_of(self._blocks) if block.area > LEAST_BLOCK_M2]
+        closed = [block for block in blocks if edge.distance(block) > 0.1]
+        return sorted(closed, key=lambda block: block.centroid.distance(shapely.Point(0, 0)))
+
+    def _find_buildable(self) -> BaseGeometry:
+        """Return the ground on which buildings may stand, away from three edges of the town."""
+        low_x, low_y, high_x, high_y = self._outline.bounds
+        inside = shapely.union_all(self._closed_blocks) if self.plan.pattern == "campus" else self._blocks
+        return shapely.intersection(inside, shapely.box(2.0 + low_x, low_y, high_x - 2.0, high_y - 2.0))
+
+    def _choose_open_blocks(self) -> list[Polygon]:
+        """Return plazas, the blocks nearest to the middle, then greens; one if only an object needs it."""
         plan = self.plan
         rng = rng_for(self.seed, "world", "open")
         has_objects = any(thing.where == "open" for thing, _ in plan.known_objects())
-        wanted = max(plan.plazas + plan.greens, int(has_objects))
-        blocks = self._closed[: max(1, len(self._closed) // 2)]
+        num_open = max(plan.plazas + plan.greens, int(has_objects))
+        blocks = self._closed_blocks[: max(1, len(self._closed_blocks) // 2)]
         num_plazas = plan.plazas or int(has_objects and not plan.greens)
         rest = blocks[num_plazas:]
         chosen = blocks[:num_plazas] + [rest[k] for k in rng.permutation(len(rest))]
-        if len(chosen) < wanted:  # open lots along streets
+        if len(chosen) < num_open:  # open lots along streets
             lots = self._lots([(0.7 * plan.block_m,) * 2], rng, setback_m=0.0)
-            chosen += [rectangle_polygon(lot) for lot in islice(lots, wanted - len(chosen))]
-        self.open_blocks = chosen[:wanted]
-        paved = self.open_blocks[: plan.plazas]
-        for green in self.open_blocks[plan.plazas :]:
+            chosen += [rectangle_polygon(lot) for lot in islice(lots, num_open - len(chosen))]
+        return chosen[:num_open]
+
+    def _pave_open_blocks(self) -> list[BaseGeometry]:
+        """Pave the plazas, and two paths that cross each green; return the paved areas."""
+        paved: list[BaseGeometry] = [*self.open_blocks[: self.plan.plazas]]
+        whole = (-0.6, 0.6)  # shares of a side: a little more than the green
+        for green in self.open_blocks[self.plan.plazas :]:
             shape = oriented_rectangle(green)
-            for across, side in enumerate(shape.size):
-                bands = [(-0.6, 0.6), (-1.5 / side, 1.5 / side)]
-                paved.append(shapely.intersection(green, rectangle_polygon(shape, *bands[:: 1 if across else -1])))
+            along, across = ((-PATH_HALF_M / side, PATH_HALF_M / side) for side in shape.size)
+            for path in (rectangle_polygon(shape, along, whole), rectangle_polygon(shape, whole, across)):
+                paved.append(shapely.intersection(green, path))
         for area in paved:
             pave(self._boxes, area, BLOCK_PIECE_M)
-        self._paved = shapely.STRtree([*self._strips, *paved])
-        self._buildable = shapely.difference(self._buildable, shapely.union_all(self.open_blocks).buffer(0.1))
-        shapely.prepare(self._buildable)
+        return paved
+
+    # --- buildings ---
 
     def _lots(self, sizes: list[Range], rng: np.random.Generator, *, setback_m: float) -> Iterator[Rectangle]:
         """Yield free lots along the streets, the nearest to the middle of the town first.
@@ -205,45 +238,51 @@ class Town:
         streets = zip(self.network.streets, self._strips, strict=True)
         taken = [*self._taken]
         for street, strip in sorted(streets, key=lambda pair: np.linalg.norm(pair[0].start + pair[0].end)):
-            front_m = street.width_m / 2 + 0.05 + setback_m
+            front_m = street.width_m / 2 + 0.05 + setback_m  # from the centre line
             reach_m = max(map(max, sizes)) + setback_m + self.plan.gap_m
             near = [outline for outline in taken if outline.dwithin(strip, reach_m)]
             for side in (1, -1):
-                along = 0.0
-                while along < street.length_m:
-                    front, depth = sizes[int(rng.integers(len(sizes)))]
-                    lot = street.rectangle((along, along + front), (side * front_m, side * (front_m + depth)))
+                along_m = 0.0
+                while along_m < street.length_m:
+                    width_m, depth_m = sizes[int(rng.integers(len(sizes)))]
+                    across = (side * front_m, side * (front_m + depth_m))
+                    lot = street.rectangle((along_m, along_m + width_m), across)
                     outline = rectangle_polygon(lot)
                     is_taken = shapely.dwithin(np.array(near, dtype=object), outline, self.plan.gap_m).any()
                     if is_taken or not self._buildable.contains(outline):
-                        along += STEP_M
+                        along_m += STEP_M
                         continue
                     yield lot._replace(yaw_deg=lot.yaw_deg + 90.0 * (1 - side))
                     taken.append(outline)
                     near.append(outline)
-                    along += front + self.plan.gap_m * rng.uniform(1.0, 1.6)
+                    along_m += width_m + self.plan.gap_m * rng.uniform(1.0, 1.6)
 
     def _build_houses(self) -> None:
         """Build the counted buildings on lots spread over the town, then fill the lots that are left."""
         rng = rng_for(self.seed, "world", "lots")
+        setback_m = self.plan.setback_m
         kinds = self.plan.kinds_of_buildings()
         for kind in kinds:
             if kind.count is not None:
-                lots = list(self._lots(_footprints(*kind.footprint_m), rng, setback_m=self.plan.setback_m))
+                lots = list(self._lots(_footprints(*kind.footprint_m), rng, setback_m=setback_m))
                 spread = np.linspace(0, len(lots) - 1, min(kind.count, len(lots))).round().astype(int)
-                for number in spread:
-                    self._build_house(lots[number], kind, rng)
-        if fill := [kind for kind in kinds if kind.count is None]:
-            sizes = [size for kind in fill for size in _footprints(*kind.footprint_m)]
-            for lot in self._lots(sizes, rng, setback_m=self.plan.setback_m):
-                low, high = (factor * lot.size[1] for factor in (0.6, 1.0))
-                fitting = [kind for kind in fill if kind.footprint_m[0] * 0.6 <= high and low <= kind.footprint_m[1]]
-                self._build_house(lot, (fitting or fill)[int(rng.integers(len(fitting or fill)))], rng)
+                for index in spread:
+                    self._build_house(lots[index], kind, rng)
+        uncounted = [kind for kind in kinds if kind.count is None]
+        if uncounted:
+            sizes = [size for kind in uncounted for size in _footprints(*kind.footprint_m)]
+            for lot in self._lots(sizes, rng, setback_m=setback_m):
+                depth_m = lot.size[1]
+                fitting = [
+                    kind for kind in uncounted
+                    if kind.footprint_m[0] * 0.6 <= depth_m and 0.6 * depth_m <= kind.footprint_m[1]
+                ] or uncounted  # fmt: skip
+                self._build_house(lot, fitting[int(rng.integers(len(fitting)))], rng)
 
     def _build_house(self, lot: Rectangle, kind: Buildings, rng: np.random.Generator) -> None:
         """Build one house on a lot, and the path to its door."""
         low, high = kind.heights_m
-        height = low + (high - low) * rng.beta(1.3, 1.7)
+        height = low + (high - low) * rng.beta(*HEIGHT_SHAPE)
         self._boxes.add("Buildings", lot.center, lot.size, 0.0, height, lot.yaw_deg)
         self._add_path(self._boxes, lot)
         self._taken.append(rectangle_polygon(lot))
@@ -258,6 +297,8 @@ class Town:
             path = boxes.framed((x, y), math.degrees(math.atan2(to_y - y, to_x - x)))
             path.lay("Sidewalks", (-0.25, -DOOR_M / 2), (line.length + 0.25, DOOR_M / 2))
 
+    # --- objects ---
+
     def _place_object(self, thing: Object, count: int) -> None:
         """Place an object `count` times: in open blocks, at a street or in the water."""
         if thing.where == "layout":
@@ -267,15 +308,16 @@ class Town:
             return
         scales = [scale for scale in SCALES if scale >= thing.least_scale - 1e-9]
         for number in range(count):
-            if (found := self._find_place(thing, scales)) is None:
-                has_place = thing.where == "open" or not self.network.water.is_empty
-                self.not_placed.append((thing.name, "no room" if has_place else "no water in the plan"))
+            scaled_place = self._find_place(thing, scales)
+            if scaled_place is None:
+                may_exist = thing.where == "open" or not self.network.water.is_empty
+                self.not_placed.append((thing.name, "no room" if may_exist else "no water in the plan"))
                 continue
-            place, scale = found
+            place, scale = scaled_place
             _add_object(self._objects, thing, place, scale)
             node = f"OBJ_{thing.name.replace(' ', '_')}_{number}"
             self.object_nodes += [(node, thing.asset)] * len(thing.parts)
-            if any(part[0] == "Buildings" for part in thing.parts):
+            if any(part.kind == "Buildings" for part in thing.parts):
                 self._add_path(self._objects, place)
             self.object_nodes += [("way", None)] * (len(self._objects) - len(self.object_nodes))
             self.placed.append(Placed(thing.name, number, place.center, place.yaw_deg, scale))
@@ -283,27 +325,30 @@ class Town:
 
     def _find_place(self, thing: Object, scales: list[float]) -> tuple[Rectangle, float] | None:
         """Return the outline and the scale of an object where there is room, else None."""
-        areas: list[tuple[BaseGeometry, float]] = []
-        if thing.where == "open":
-            areas = [(block, oriented_rectangle(block).yaw_deg) for block in self.open_blocks]
-        elif thing.where == "water":
-            over = [one.rectangle((0.0, one.length_m), (-one.width_m, one.width_m)) for one in self.network.bridges]
-            bridges = shapely.union_all([rectangle_polygon(one) for one in over])
-            areas = [(shapely.difference(self.network.water, bridges), 0.0)]
-        for area, yaw_deg in areas:
-            if not area.is_empty and (place := self._place_in(thing, area, scales, yaw_deg)) is not None:
-                return place
-        for scale in scales if thing.where == "open" else ():
+        if thing.where == "water":
+            bridges = shapely.union_all([
+                rectangle_polygon(bridge.rectangle((0.0, bridge.length_m), (-bridge.width_m, bridge.width_m)))
+                for bridge in self.network.bridges
+            ])  # fmt: skip
+            return self._place_in(thing, shapely.difference(self.network.water, bridges), scales, 0.0)
+        for block in self.open_blocks:
+            scaled_place = self._place_in(thing, block, scales, oriented_rectangle(block).yaw_deg)
+            if scaled_place is not None:
+                return scaled_place
+        for scale in scales:
             size = thing.size_m[0] * scale, thing.size_m[1] * scale
             lots = self._lots([size], rng_for(self.seed, "world", thing.name), setback_m=self.plan.setback_m)
-            if lot := next(lots, None):
+            lot = next(lots, None)
+            if lot is not None:
                 return lot, scale
         return None
 
     def _place_in(
         self, thing: Object, area: BaseGeometry, scales: list[float], yaw_deg: float
     ) -> tuple[Rectangle, float] | None:
-        """Return a place of an object in an area, along its yaw or across, near the middle."""
+        """Return a place and the scale of an object in an area, along its yaw or across, near the middle; else None."""
+        if area.is_empty:
+            return None
         turned = rotate(area, -yaw_deg, origin=(0, 0))
         near = [outline for outline in self._taken if outline.distance(area) < SPACE_M]
         tree = shapely.STRtree([rotate(outline, -yaw_deg, origin=(0, 0)) for outline in near])
@@ -313,9 +358,10 @@ class Town:
         centers = np.stack([x.ravel(), y.ravel()], axis=1)
         away_m = np.hypot(*(centers - np.array(turned.centroid.coords[0])).T)
         x, y = centers[np.argsort(away_m, kind="stable")].T
+        turns_deg = (0.0, 90.0) if thing.where == "open" else (0.0,)
         for scale in scales:
             wide, deep = (side * scale for side in thing.size_m)
-            for turn_deg in (0.0, 90.0) if thing.where == "open" else (0.0,):
+            for turn_deg in turns_deg:
                 half_x, half_y = (wide / 2, deep / 2) if turn_deg == 0 else (deep / 2, wide / 2)
                 outlines = shapely.box(x - half_x, y - half_y, x + half_x, y + half_y)
                 for outline in outlines[shapely.contains_properly(turned, outlines)]:
@@ -324,21 +370,25 @@ class Town:
                         return Rectangle((middle.x, middle.y), (wide, deep), yaw_deg + turn_deg), scale
         return None
 
-    def _set_trees(self, rng: np.random.Generator) -> None:
-        """Fell or plant trees until their number is within the plan's range."""
+    # --- trees ---
+
+    def _with_trees(self, rng: np.random.Generator) -> BoxMap:
+        """Return the layout with trees felled or planted until their number is within the plan's range."""
         low, high = self.plan.trees_per_ha
         hectares = self.land_m2 / 1e4
         trees = np.flatnonzero(trees_of(self.layout))
-        goal = round((0.65 * low + 0.35 * high) * hectares)
+        goal = round(((1 - TREE_GOAL) * low + TREE_GOAL * high) * hectares)
         if len(trees) > high * hectares:
             felled = rng.choice(trees, len(trees) - goal, replace=False)
-            self.layout = self.layout.select(np.setdiff1d(np.arange(len(self.layout)), felled))
-        elif len(trees) < goal:
-            self.layout = self.layout.joined(self._planted(goal - len(trees), rng))
+            return self.layout.select(np.setdiff1d(np.arange(len(self.layout)), felled))
+        if len(trees) < goal:
+            return self.layout.joined(self._planted(goal - len(trees), rng))
+        return self.layout
 
     def _planted(self, count: int, rng: np.random.Generator) -> BoxMap:
         """Return new trees in the blocks, clear of all other boxes and of the paths to doors."""
-        world, boxes = self.boxes, BoxList()
+        world = self.boxes
+        boxes = BoxList()
         is_ground = of_kinds(world, "Roads", "Terrain", "RoadLines") | (world.maxs[:, 2] <= 0.0)
         is_path = of_kinds(world, "Sidewalks") & ((2 * world.half_extents[:, :2]).min(1) < 5.0)
         obstacles = shapely.STRtree(footprints(world)[~is_ground | is_path])
@@ -357,39 +407,43 @@ class Town:
 def _add_object(boxes: BoxList, thing: Object, place: Rectangle, scale: float) -> None:
     """Add an object's boxes; the heights of its high parts are scaled like its footprint."""
     placed = boxes.framed(place.center, place.yaw_deg)
-    for kind, x, y, wide, deep, low, high in thing.parts:
-        tall = scale if high > 1.0 else 1.0
-        placed.add(kind, (scale * x, scale * y), (wide * scale, deep * scale), min(low, low * tall), high * tall)
+    for part in thing.parts:
+        tall = scale if part.high > 1.0 else 1.0
+        center, size = (scale * part.x, scale * part.y), (part.wide * scale, part.deep * scale)
+        placed.add(part.kind, center, size, min(part.low, part.low * tall), part.high * tall)
+
+
+# --- nodes of SimWorld ------------------------------------------------------------------------------------------------
 
 
 @cache
 def _asset_tables() -> dict[str, dict[str, Size]]:
     """Return the assets that boxes of a kind may get, and their full sizes, m."""
-    furniture: dict[str, Size] = {
-        {"BP_Trash_bin_*": "BP_Trash_bin_a_C"}.get(asset.pattern, asset.pattern.replace("*", "")): tuple(asset.size_m)
-        for asset in ASSETS if asset.size_m is not None and asset.kind == "Static"
-    }  # fmt: skip
-    buildings, trees = (
-        {name: size for name, size in assets().items() if name.startswith(start)}
-        for start in ("BP_Building", "BP_Tree")
-    )
+    furniture: dict[str, Size] = {}
+    for asset in ASSETS:
+        if asset.size_m is not None and asset.kind == "Static":
+            is_bin = asset.pattern == "BP_Trash_bin_*"  # of several assets; other patterns stand for one
+            furniture["BP_Trash_bin_a_C" if is_bin else asset.pattern.replace("*", "")] = tuple(asset.size_m)
+    buildings = {name: size for name, size in assets().items() if name.startswith("BP_Building")}
+    trees = {name: size for name, size in assets().items() if name.startswith("BP_Tree")}
     return {"Buildings": buildings, "Vegetation": trees, "Static": furniture}
 
 
 def asset_for(kind: str, size_m: Size) -> tuple[str, Size]:
     """Return the asset with the most similar box, and its size; one named after the kind if none is similar."""
+    table = _asset_tables().get(kind, {})
     stretches = {  # logarithms of the factors along x, y, z that turn the asset into the box
-        name: [math.log(wanted / asset) for wanted, asset in zip(size_m, asset_size_m, strict=True)]
-        for name, asset_size_m in _asset_tables().get(kind, {}).items()
+        name: [math.log(side_m / asset_side_m) for side_m, asset_side_m in zip(size_m, asset_size_m, strict=True)]
+        for name, asset_size_m in table.items()
     }
     name = min(stretches, key=lambda name: sum(x * x for x in stretches[name]), default=None)
-    if (
-        name is None
-        or max(stretches[name]) - min(stretches[name]) > math.log(STRETCH)
-        or (kind == "Static" and max(map(abs, stretches[name])) > math.log(2.0))
-    ):
-        return f"{kind}_C", (1.0, 1.0, 1.0)
-    return name, _asset_tables()[kind][name]
+    if name is not None:
+        stretch = stretches[name]
+        is_distorted = max(stretch) - min(stretch) > math.log(STRETCH)
+        has_other_size = kind == "Static" and max(map(abs, stretch)) > math.log(2.0)
+        if not (is_distorted or has_other_size):
+            return name, table[name]
+    return f"{kind}_C", (1.0, 1.0, 1.0)
 
 
 def layout_nodes(town: Town) -> list[dict[str, Any]]:
