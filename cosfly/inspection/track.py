@@ -1,6 +1,7 @@
 """The inspection of one track: its plan, poses, motion and frames, and its record (sec:step6).
 
-The rendered poses are measured against the map, because the poses of a perturbed track differ from the plan.
+Each check adds its issues to `report` and its figures to `metrics`. The rendered poses are measured against the map,
+because the poses of a perturbed track differ from the plan.
 """
 
 from __future__ import annotations
@@ -263,8 +264,9 @@ def _check_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Met
     digests = listed_digests(track.folder, report) if cfg.check_checksums else {}
     frames = check_frames(track, metas, bystanders, digests, report)
     for name, digest in digests.items():
-        advance()
-        compare_file(track.folder, name, digest, report)
+        if name not in frames.read_files:
+            advance()
+            compare_file(track.folder, name, digest, report)
     visibility = target.visibility[~np.isnan(target.visibility)]
     quality = float(np.mean(frames.track_ious)) if frames.track_ious else None
     invalid = max(frames.invalid_depth_shares, default=None)
