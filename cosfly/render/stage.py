@@ -124,7 +124,7 @@ def make_track_script(
         town=town,
         trajectory=f"{TRAJECTORY}{cfg.first_timestamp + number}",
         variant=VARIANTS[track],
-        number=number,
+        path_index=number,
         trace=trace,
         cameras=cameras,
         perturbed=perturbed,
