@@ -15,6 +15,7 @@ from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT
 from cosfly.formats.people import COLORS, EMPTY_SHARE, FIGURES, GARMENTS, HAIR, Appearance, People
 from cosfly.geometry.axes import headings_of, rotation_matrices, rotation_matrix
 from cosfly.geometry.kernels import distances_to_boxes_m
+from cosfly.render.camera import RenderedVisibility
 from cosfly.render.contract import Clothes, Frame, PosedPeople, PosedPerson, other_id
 
 STRIDE_M = 1.35  # two steps
@@ -128,12 +129,12 @@ class DressedBystanders:
             for number, other in enumerate(self.others)
         }
 
-    def meta(self, i: int, frame: Frame, hidden_by_others: float, hidden_by_map: float) -> BystandersMeta:
-        """Return the annotation of the bystanders in frame i."""
+    def meta(self, i: int, frame: Frame, visibility: RenderedVisibility) -> BystandersMeta:
+        """Return the annotation of the bystanders in frame i; visibility: that of the target."""
         pixels = np.bincount(frame.ids.ravel(), minlength=other_id(0) + 1)
         return BystandersMeta(
-            target_hidden_by_others=round(hidden_by_others, SHARE_DIGITS),
-            target_hidden_by_map=round(hidden_by_map, SHARE_DIGITS),
+            target_hidden_by_others=round(visibility.hidden_by_bystanders, SHARE_DIGITS),
+            target_hidden_by_map=round(visibility.hidden_by_map, SHARE_DIGITS),
             others=[
                 BystanderMeta(
                     instance_id=other_id(number),

@@ -159,7 +159,7 @@ def draw_frame(renderer: Renderer, script: TrackScript, i: int, poses: Poses, vi
     frame = renderer.render(pose, camera.intrinsic, {PERSON_ID: target, **bystanders})
     view = view_target(target_m, pose, camera)
     ids = np.array(list(bystanders), dtype=np.int64)
-    score, by_bystanders, by_map = rendered_visibility(frame, target_m, view, pose, camera, ids)
+    visibility = rendered_visibility(frame, target_m, view, pose, camera, ids)
     is_person = frame.ids == PERSON_ID
     num_px = int(np.count_nonzero(is_person))
     target_meta = TargetMeta(
@@ -173,11 +173,11 @@ def draw_frame(renderer: Renderer, script: TrackScript, i: int, poses: Poses, vi
         depth_m=view.depth_m,
         in_view=view.in_view,
         # A thin pole may hide the person and not the box: both depth and mask must show the target.
-        visible=view.in_view and score > visible_threshold and num_px > 0,
-        visibility=score,
+        visible=view.in_view and visibility.score > visible_threshold and num_px > 0,
+        visibility=visibility.score,
         num_pixels=num_px,
     )
-    bystanders_meta = script.bystanders.meta(i, frame, by_bystanders, by_map) if bystanders else None
+    bystanders_meta = script.bystanders.meta(i, frame, visibility) if bystanders else None
     return DrawnFrame(frame, target_meta, bystanders_meta)
 
 
