@@ -139,18 +139,13 @@ class _Surfaces(NamedTuple):
 
     frame: int
     view: View
+    lens: np.ndarray  # (4,) focal lengths and principal point, px
 
 
 def _surfaces(track: Track, i: int, picture: Picture) -> _Surfaces:
     pose = world_from_camera(track.positions_m[i], track.rotations_deg[i])
-    return _Surfaces(i, View(picture.depth, picture.instance, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy()))
-
-
-def _agreement(track: Track, previous: _Surfaces, surfaces: _Surfaces) -> Agreement:
-    """Return how well the surfaces of a frame agree with those of the previous one."""
-    fx_fy_cx_cy = np.s_[[0, 1, 0, 1], [0, 1, 2, 2]]
-    intrinsics = [track.camera_at(frame).intrinsic[fx_fy_cx_cy] for frame in (previous.frame, surfaces.frame)]
-    return compare_views(previous.view, surfaces.view, *intrinsics)
+    view = View(picture.depth, picture.instance, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy())
+    return _Surfaces(i, view, track.camera_at(i).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]])
 
 
 def _report_jumps(track: Track, pairs: dict[int, Agreement], report: Report) -> int:
@@ -228,7 +223,6 @@ class FrameNumbers:
     """Figures of the pixels of one track."""
 
     read_files: set[str] = field(default_factory=set)  # names in the track's folder; their digests were compared
-
     num_checked: int = 0
     num_compared: int = 0  # with the previous frame
     track_ious: list[float] = field(default_factory=list)  # of the frames that show the target
@@ -252,20 +246,20 @@ def check_frames(
         if picture is None:
             continue
         numbers.num_checked += 1
-        small = cv2.resize(picture.colours[::SMALL_ROWS], SMALL_PX, interpolation=cv2.INTER_AREA)
-        small_picture = _SmallPicture(i, small)
-        _check_colours(track, small_picture, previous_small, report)
-        previous_small = small_picture
+        small = _SmallPicture(i, cv2.resize(picture.colours[::SMALL_ROWS], SMALL_PX, interpolation=cv2.INTER_AREA))
+        _check_colours(track, small, previous_small, report)
+        previous_small = small
         is_bystander = np.zeros(NUM_IDS, dtype=np.bool_)
-        others = bystanders[i].others if i in bystanders else ()
-        is_bystander[[other.instance_id for other in others if other.instance_id < NUM_IDS]] = True
+        people = bystanders[i].others if i in bystanders else ()
+        is_bystander[[person.instance_id for person in people if person.instance_id < NUM_IDS]] = True
         figures = measure_pixels(picture, is_bystander, limits.FLAT_PAIRS_MIN)
         _check_surfaces(figures, frame_name(i), report)
         if not picture.depth.size or not _check_depth(picture.depth, _depth_place(track, i), numbers, report):
             continue
         surfaces = _surfaces(track, i, picture)
-        if previous_surfaces is not None and i - previous_surfaces.frame <= NEAR_FRAMES:
-            agreements[i] = _agreement(track, previous_surfaces, surfaces)
+        before = previous_surfaces
+        if before is not None and i - before.frame <= NEAR_FRAMES:
+            agreements[i] = compare_views(before.view, surfaces.view, before.lens, surfaces.lens)
         previous_surfaces = surfaces
         if picture.instance.size:
             _check_mask(track, i, picture, figures, is_bystander, numbers, report)

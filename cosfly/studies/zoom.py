@@ -22,6 +22,7 @@ from cosfly.render.camera import ZoomConfig
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, write_json
+from cosfly.viz.frame_views import spread
 from cosfly.viz.tables import TextTable, cells
 from cosfly.viz.topview import captioned_grid
 
@@ -124,9 +125,8 @@ def _best_frame(track: Track) -> int:
 def _draw_levels(levels: dict[float, list[Track]]) -> bytes:
     """Draw one frame of up to four tracks, one row each, at every level (fig:zoom_demo); return a PNG."""
     wide = next(iter(levels.values()))
-    picked = np.unique(np.linspace(0, len(wide) - 1, min(len(wide), MOST_SHOWN)).round().astype(int))
     panels = []
-    for k in picked.tolist():
+    for k in spread(len(wide), MOST_SHOWN):
         i = _best_frame(wide[k])
         for fov, tracks in levels.items():
             rgb = read_rgb(tracks[k].frame_folder(i)).copy()

@@ -60,8 +60,8 @@ class CaptionOutcome(NamedTuple):
 
 
 @dataclass
-class PageTrack:
-    """A track on the page; its captions stay in their file."""
+class TrackEntry:
+    """A track to show; its captions stay in their file."""
 
     path: Path
     captions: Path | None
@@ -84,27 +84,29 @@ def run(
 
     Args:
         captions: `captions.jsonl` of a playback tree; a run has its own.
-        picture_px: Width of a colour picture; the others have half of it.
-        most_tracks: Of more, whole trajectories are shown, evenly spread.
-        most_frames: Of a track, among them one of each verdict and decision.
+        picture_px: Width of a colour picture; the other pictures have half of it.
+        most_tracks: Greatest number of tracks; of more, whole trajectories are chosen, evenly spread.
+        most_frames: Greatest number of frames of a track, among them one of each verdict and decision.
     """
     trees = _find_trees(folder, captions)
     all_tracks = {
-        tree.place(place_of(path)): PageTrack(path, tree.captions) for tree in trees for path in find_tracks(tree.data)
+        tree.place(place_of(path)): TrackEntry(path, tree.captions) for tree in trees for path in find_tracks(tree.data)
     }
     tracks = {place: all_tracks[place] for place in _choose_tracks(list(all_tracks), most_tracks)}
-    notes = [f"{len(tracks):,} of {len(all_tracks):,} tracks are shown"] if len(tracks) < len(all_tracks) else []
+    notes = list[str]()
+    if len(tracks) < len(all_tracks):
+        notes.append(f"{len(tracks):,} of {len(all_tracks):,} tracks are shown")
     for tree in trees:
         _add_records(tracks, tree)
     flights = []
     with progress_bar("viewer: tracks", len(tracks)) as advance:
-        for place, page_track in tracks.items():
+        for place, entry in tracks.items():
             try:
-                track = read_track(page_track.path)
+                track = read_track(entry.path)
             except InputError as error:
                 notes.append(f"not shown: {place.trajectory}/{place.variant}: {error.what}")
             else:
-                flights.append(_flight(place, track, page_track, most_frames, picture_px))
+                flights.append(_flight(place, track, entry, most_frames, picture_px))
             advance(1)
     title = folder.absolute().name
     data = {"title": title, "notes": notes, "maps": _maps(trees, flights), "flights": flights}
@@ -133,9 +135,11 @@ def _printable(value: Any) -> Any:
 
 def _find_trees(folder: Path, captions: Path | None) -> list[Tree]:
     """Return the trees of a folder: those of a run, of the towns of a run, or the folder itself as a playback tree."""
-    towns = sorted(path.parent for path in folder.glob("*/render") if path.is_dir())
+    run_folders = [folder]
+    if not (folder / "render").is_dir():
+        run_folders = sorted(path.parent for path in folder.glob("*/render") if path.is_dir())
     trees = []
-    for run_folder in [folder] if (folder / "render").is_dir() else towns:
+    for run_folder in run_folders:
         trees.append(
             Tree(
                 run=folder_name(run_folder.absolute().name),
@@ -152,7 +156,7 @@ def _existing(path: Path) -> Path | None:
     return path if path.exists() else None
 
 
-def _add_records(tracks: dict[Place, PageTrack], tree: Tree) -> None:
+def _add_records(tracks: dict[Place, TrackEntry], tree: Tree) -> None:
     """Add the captions and the results of the inspection of a tree to its tracks."""
     if tree.captions is not None:
         for span, caption in caption_spans(tree.captions):
@@ -199,23 +203,23 @@ def choose_frames(num_frames: int, outcomes: Mapping[int, CaptionOutcome], most:
 # --- the page's data --------------------------------------------------------------------------------------------------
 
 
-def _flight(place: Place, track: Track, page_track: PageTrack, most_frames: int, picture_px: int) -> dict[str, Any]:
+def _flight(place: Place, track: Track, entry: TrackEntry, most_frames: int, picture_px: int) -> dict[str, Any]:
     """Return a track with some of its frames."""
     names = [name for name in (place.run, track.town, track.trajectory, track.variant) if name]
-    chosen = choose_frames(len(track), page_track.outcomes, most_frames)
+    chosen = choose_frames(len(track), entry.outcomes, most_frames)
     return {
         "name": "/".join(names),
         "group": "/".join(names[:-1]),  # both tracks of a trajectory
         "map": f"{place.run}/{track.town}",
         "town": track.town,
         "track": "clean" if track.is_original else "perturbed",
-        "result": page_track.result,
+        "result": entry.result,
         "fovs_deg": [round(fov_deg, 1) for fov_deg in track.fovs_deg],
         "num_frames": len(track),
-        "num_captions": len(page_track.outcomes),
+        "num_captions": len(entry.outcomes),
         "drone_path": _path(track.positions_m[:, :2]),
         "target_path": _path(track.targets_m[:, :2]),
-        "frames": [_frame(track, i, page_track.caption(i), picture_px) for i in chosen],
+        "frames": [_frame(track, i, entry.caption(i), picture_px) for i in chosen],
     }
 
 
