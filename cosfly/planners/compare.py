@@ -317,8 +317,10 @@ def run(
         "notes": {name: NOTES[name] for name in cfg.planners if name in NOTES},
     }
     write_json(product, {**FORMAT.header, **header, **facts, **summarize(planned, cfg.planners)})
-    planned_traces = [item.read_traces(path_id) for path_id, item in planned.items()]
-    traces = {name: [by_planner[name] for by_planner in planned_traces if name in by_planner] for name in cfg.planners}
+    traces: dict[str, list[DroneTrace]] = {name: [] for name in cfg.planners}
+    for path_id, item in planned.items():
+        for name, trace in item.read_traces(path_id).items():
+            traces[name].append(trace)
     trace_paths = {name: out / f"drone_trace_{name}.json" for name in traces}
     for name, path in trace_paths.items():
         write_traces(path, traces[name], {**header, "planner": name})

@@ -96,25 +96,27 @@ def _draw_segment_styles(
         if style != mirror_style:
             shares[mirror_style] = shares[style] / 2.0
             shares[style] = shares[mirror_style]
-    left = [*range(len(stretches))]  # without a style yet
-    left_share = sum(shares.values())
+    unassigned = [*range(len(stretches))]
+    unassigned_share = sum(shares.values())
     style_of = dict[int, str]()
     for motion, measure in MEASURES.items():
         suited_shares = {style: share for style, share in shares.items() if suits(style) == motion}
         share = sum(suited_shares.values())
-        if not (left and share):
+        if not (unassigned and share):
             continue
-        left.sort(key=lambda k: (-measure(stretches[k].pedestrian, stretches[k].points), k))
-        lengths = np.array([len(stretches[k].points) for k in left])
+        unassigned.sort(key=lambda k: (-measure(stretches[k].pedestrian, stretches[k].points), k))
+        # The last stretch is rounded at random: it counts if a random point of it is within the share of the time.
+        lengths = np.array([len(stretches[k].points) for k in unassigned])
         ends = np.cumsum(lengths) - rng.random() * lengths
-        num = int((ends <= lengths.sum() * share / left_share).sum())
-        left_share -= share
-        style_of |= zip(sorted(left[:num]), draw_to_quota(suited_shares, rng), strict=False)
-        left = left[num:]
+        num = int((ends <= lengths.sum() * share / unassigned_share).sum())
+        unassigned_share -= share
+        style_of |= zip(sorted(unassigned[:num]), draw_to_quota(suited_shares, rng), strict=False)
+        unassigned = unassigned[num:]
     return [style_of[k] for k in range(len(stretches))]
 
 
 def _straightness(pedestrian: PedestrianTrajectory, points: np.ndarray) -> float:
+    """Return the distance from the first to the last point over the length of the path between them."""
     steps_m = np.diff(pedestrian.positions_m[points, :2], axis=0)
     return float(np.hypot(*steps_m.sum(axis=0)) / max(float(np.hypot(*steps_m.T).sum()), 1e-9))
 
@@ -227,22 +229,23 @@ def end_with_order(
     first_frame = max(1, int(num * PURSUIT_LEAST))
     last_arrival = num - round(HOLDS_S / dt_s)
     order_frame = num - 1
-    while True:
-        legs = _legs_home(positions_m[: order_frame + 1], scenario.targets_m[order_frame], obstacles, cfg, dt_s)
-        num_home = sum(map(len, legs))
+    while True:  # earlier and earlier, until the drone arrives in time
+        trail_m = positions_m[: order_frame + 1]
+        leg_away, leg_home = _legs_home(trail_m, scenario.targets_m[order_frame], obstacles, cfg, dt_s)
+        num_home = len(leg_away) + len(leg_home)
         if order_frame <= first_frame or order_frame + num_home <= last_arrival:
             break
         order_frame = max(first_frame, min(order_frame - 1, last_arrival - num_home))
     if order_frame + num_home > last_arrival:
         whole = Segment(RETURN_HOME, 0, num, keeps_sight=False)
         return replace(maneuvers, impossible="no_time_for_home", segments=(whole,)), positions_m
-    flown = np.vstack([positions_m[: order_frame + 1], *legs])
+    flown = np.vstack([trail_m, leg_away, leg_home])
     positions = np.vstack([flown, np.tile(flown[-1], (num - len(flown), 1))])
     # Smooth the way home; the pursuit stays as it is.
     share = np.clip((np.arange(num) - order_frame) * dt_s / (2.0 * ROUNDING_S), 0.0, 1.0)[:, None]
     positions += share * (gaussian_filter1d(positions, ROUNDING_S / dt_s, axis=0, mode="nearest") - positions)
     home_m = np.round(positions_m[0], 4)
-    mission = Mission(maneuvers.order, order_frame, order_frame + len(legs[0]), tuple(home_m.tolist()))
+    mission = Mission(maneuvers.order, order_frame, order_frame + len(leg_away), tuple(home_m.tolist()))
     pursuit = tuple(
         Segment(segment.style, segment.begin, min(segment.end, order_frame))
         for segment in maneuvers.segments
@@ -257,9 +260,11 @@ def end_with_order(
 
 def _legs_home(
     trail_m: np.ndarray, target_m: np.ndarray, obstacles: BoxIndex, cfg: PlanConfig, dt_s: float
-) -> list[np.ndarray]:
-    """Return the leg from the end of a trail (k, 3) away from the target, and the leg home along the trail, with
-    shortcuts where they are free."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the leg from the end of a trail (k, 3) away from the target, and the leg home.
+
+    The leg home goes back along the trail, with shortcuts where they are free.
+    """
     from cosfly.geometry.kernels import segments_hit
 
     def are_free(start: np.ndarray, ends: np.ndarray) -> np.ndarray:
@@ -278,8 +283,7 @@ def _legs_home(
         trail_index = int(np.argmax(free)) if free.any() else trail_index - 1
         corners.append(trail_m[trail_index])
     leg_away = _positions_along(np.stack([here, aside]), LEAVES_MPS, dt_s)
-    leg_home = _positions_along(np.stack(corners), HOME_MPS, dt_s)
-    return [leg_away, leg_home]
+    return leg_away, _positions_along(np.stack(corners), HOME_MPS, dt_s)
 
 
 def _positions_along(corners_m: np.ndarray, most_mps: float, dt_s: float) -> np.ndarray:
