@@ -172,24 +172,13 @@ def run(
 
     Trajectories that the planner dropped are not drawn; the manifest counts them. Return the tree's root, `out`.
     """
-    inputs = {"boxes": boxes, "simplified": simplified, "traces": traces} | ({"others": others} if others else {})
-    read_pools(cfg)  # checked before anything is written
-    inputs |= cfg.pool_files()
-    checked_inputs(inputs)  # before the map is read for the names of its meshes, which are inputs too
-    box_map = read_boxes(boxes)
-    inputs |= {f"mesh {name}": path for name, path in box_map.meshes.files().items()}
-    if cfg.path_index is not None and cfg.path_index >= (num := len(read_traces(traces))):
-        problem = "the input has no drone trajectory with this index"
-        expected = f"an index from 0 to {num - 1}"
-        raise ConfigError(problem, where="render.path_index", got=cfg.path_index, expected=expected)
+    files = RenderInputs(boxes, simplified, traces, others)
+    box_map, inputs = _checked_inputs(cfg, files)
     stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed)
     if stage.is_complete:
         return out
     check_ground(box_map, boxes)
-    all_traces = read_traces(traces)
-    if twice := [path_id for path_id, n in Counter(trace.path_id for trace in all_traces).items() if n > 1]:
-        fix = "run the plan stage again"
-        raise InputError("two drone trajectories have the same id", where=traces, got=min(twice), fix=fix)
+    all_traces = _read_distinct_traces(traces)
     passed = {
         path_index: trace
         for path_index, trace in enumerate(all_traces)
@@ -202,14 +191,13 @@ def run(
     ids = instance_ids(box_map, num_others)
     if num_shared := int((ids == SHARED_ID).sum()):
         log.warning("render: %d boxes share the instance id %d, because ids have 16 bits", num_shared, SHARED_ID)
-    town, updates = _names(stage, cfg, box_map.name, traces, others, seed)
+    town, updates = _names(stage, cfg, box_map.name, files, seed)
     cfg = cfg.model_copy(update=updates)
     items = [
         Item(f"{trace.path_id}/{VARIANTS[track]}", (path_index, track), len(trace.time_s[:: cfg.frame_stride]))
         for path_index, trace in passed.items()
         for track in cfg.tracks
     ]
-    files = RenderInputs(boxes, simplified, traces, others)
     arguments = (cfg, files, out, town, seed, min(workers, len(items)))
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="render: frames")
     ids_file = _write_ids(out / town, box_map, ids, num_others)
@@ -230,9 +218,35 @@ def run(
     return out
 
 
-def _write_ids(town_folder: Path, box_map: BoxMap, ids: np.ndarray, num_others: int) -> Path:
+def _checked_inputs(cfg: RenderConfig, files: RenderInputs) -> tuple[BoxMap, dict[str, Path]]:
+    """Check settings and inputs before anything is written; return the drawn map and the paths of all inputs."""
+    inputs = {"boxes": files.boxes, "simplified": files.simplified, "traces": files.traces}
+    if files.others is not None:
+        inputs["others"] = files.others
+    read_pools(cfg)
+    inputs |= cfg.pool_files()
+    checked_inputs(inputs)  # before the map is read for the names of its meshes, which are inputs too
+    box_map = read_boxes(files.boxes)
+    inputs |= {f"mesh {name}": path for name, path in box_map.meshes.files().items()}
+    if cfg.path_index is not None and cfg.path_index >= (num := len(read_traces(files.traces))):
+        problem = "the input has no drone trajectory with this index"
+        expected = f"an index from 0 to {num - 1}"
+        raise ConfigError(problem, where="render.path_index", got=cfg.path_index, expected=expected)
+    return box_map, inputs
+
+
+def _read_distinct_traces(path: Path) -> list[DroneTrace]:
+    """Read the drone trajectories; raise InputError if two have the same id."""
+    traces = read_traces(path)
+    if twice := [path_id for path_id, num in Counter(trace.path_id for trace in traces).items() if num > 1]:
+        fix = "run the plan stage again"
+        raise InputError("two drone trajectories have the same id", where=path, got=min(twice), fix=fix)
+    return traces
+
+
+def _write_ids(folder: Path, box_map: BoxMap, ids: np.ndarray, num_others: int) -> Path:
     """Write which instance ids the people and the boxes of a map have; ids: (n,) of the boxes."""
-    path = town_folder / IDS_FILE
+    path = folder / IDS_FILE
     record = {
         **IDS_FORMAT.header,
         "person": PERSON_ID,
@@ -277,7 +291,7 @@ def bystanders_of(others: Path | None, traces: list[DroneTrace]) -> tuple[dict[s
 
 
 def _names(
-    stage: StageFolder, cfg: RenderConfig, map_name: str, traces: Path, others: Path | None, seed: int
+    stage: StageFolder, cfg: RenderConfig, map_name: str, files: RenderInputs, seed: int
 ) -> tuple[str, dict[str, int]]:
     """Return the town's folder, and the settings that name the first trajectory and seed the weather.
 
@@ -286,12 +300,14 @@ def _names(
     town = town_folder(cfg.town or map_name)
     settings = cfg.recorded()
     del settings["depth_format"]  # poses are the same in either
-    named_by = [town, seed, fingerprint(traces), settings, *([] if others is None else [fingerprint(others)])]
+    named_by = [town, seed, fingerprint(files.traces), settings]
+    if files.others is not None:
+        named_by.append(fingerprint(files.others))
     first = cfg.first_timestamp
     weather_seed = cfg.weather_seed
     if first is None:
         first = FIRST_S + int(sha256_bytes(dump_json(named_by).encode()), 16) % SPAN_S
-    index_of = {trace.path_id: path_index for path_index, trace in enumerate(read_traces(traces))}
+    index_of = {trace.path_id: path_index for path_index, trace in enumerate(read_traces(files.traces))}
     existing = [  # index of the trajectory and track
         (index_of[path_id], result_of(item, _RenderedTrack))
         for item in stage.items()

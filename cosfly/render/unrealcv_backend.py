@@ -24,16 +24,9 @@ from cosfly.runtime.errors import ConfigError, InputError, RenderError, shown
 from cosfly.runtime.png import colours_of
 from cosfly.simulators import unrealcv_client
 from cosfly.simulators.assets import id_of, kind_of
-from cosfly.simulators.conventions import FAR_CM, camera_rotation_deg, unreal_pose, world_pose
+from cosfly.simulators.conventions import FAR_UNITS, camera_rotation_deg, unreal_pose, world_pose
 from cosfly.simulators.guard import EngineGuard
-from cosfly.simulators.unrealcv_client import (
-    OURS,
-    NoAnswerError,
-    UnrealCvConfig,
-    UnrealCvConnection,
-    is_refusal,
-    spawned_by_cosfly,
-)
+from cosfly.simulators.unrealcv_client import NoAnswerError, UnrealCvConfig, UnrealCvConnection, is_refusal
 
 log = logging.getLogger(__name__)
 
@@ -107,7 +100,7 @@ class UnrealCvRenderer(SimulatorRenderer):
             state = zip(properties, self._server.ask(*(f"vget {name}" for name in properties)), strict=True)
             self._guard.note([f"vset {name} {text!s}" for name, text in state if not is_refusal(text)])
         (answer,) = self._server.ask("vget /objects")
-        leftover = spawned_by_cosfly(str(answer))  # by a connection that broke
+        leftover = unrealcv_client.spawned_by_cosfly(str(answer))  # by a connection that broke
         self._server.run(*(f"vset /object/{name}/destroy" for name in leftover))
         objects = self._read_objects([name for name in str(answer).split() if name not in leftover])
         num_doubtful = self._make_tables(objects)
@@ -266,7 +259,7 @@ class UnrealCvRenderer(SimulatorRenderer):
         kinds = self._kinds[colors]
         ids = self._ids[colors]
         depth_m = raw / np.float32(self._cfg.coord_scale)
-        is_sky = ~(raw < FAR_CM)  # in the level's units; also NaN is sky
+        is_sky = ~(raw < FAR_UNITS)  # NaN is sky too
         depth_m[depth_m < NEAR_M] = INVALID_DEPTH_M
         depth_m[is_sky] = SKY_DEPTH_M
         kinds[is_sky] = KINDS["Sky"]
@@ -294,7 +287,7 @@ class UnrealCvRenderer(SimulatorRenderer):
 
     def _spawn(self, instance_id: int) -> str:
         """Spawn a person, in a colour that no other object has; return its name."""
-        name = f"{OURS}{instance_id}"
+        name = f"{unrealcv_client.OURS}{instance_id}"
         color = next(c for c in range(COLORS - 1, 0, -1) if c not in self._used_colors)
         paint = f"{color >> 16} {color >> 8 & 0xFF} {color & 0xFF}"
         self._server.run(

@@ -44,7 +44,7 @@ PATTERN_M = 720.0  # common multiple of the patterns' sizes: the scene's origin 
 ORIGIN_STEP_M = 2.0 * PATTERN_M  # a trajectory farther off than half of this has an origin of its own
 
 
-class _Look(NamedTuple):
+class _WeatherPrograms(NamedTuple):
     """What draws one kind of weather."""
 
     programs: Programs
@@ -96,7 +96,7 @@ class GlRenderer:
             self._arrays: dict[tuple[int, int], tuple[Any, Any]] = {}  # made when needed
             texts = programs.sources(("part.glsl", "depth.vert.glsl"), ("depth.frag.glsl",))
             self._depth_program = context.program(*texts)
-            self._looks: dict[str | None, _Look] = {}
+            self._by_weather: dict[str | None, _WeatherPrograms] = {}
             self._use_weather(None)
         self._open_map(box_map)
         self.prepare(*self.scene.bounds())
@@ -108,7 +108,7 @@ class GlRenderer:
         """
         other = copy.copy(self)
         other._opened_by = self  # whose end releases the context
-        other._looks = {None: self._looks[None]}  # the others are prepared for a map
+        other._by_weather = {None: self._by_weather[None]}  # the others are prepared for a map
         other._open_map(box_map)
         return other
 
@@ -129,14 +129,14 @@ class GlRenderer:
 
     def _use_weather(self, define: str | None) -> None:
         """Switch to the programs of fair weather (None), or of a weather with these defines."""
-        if define not in self._looks:
+        if define not in self._by_weather:
             compiled = programs.programs_of(self.context, define, snaps=not self._is_software)
             weather = None
             if define is not None:
                 weather = WeatherPass(self.context, self._over_color, self._depth, compiled.rain)
             sky, shadow = (self.context.vertex_array(program, []) for program in (compiled.sky, compiled.shadow))
-            self._looks[define] = _Look(compiled, sky, shadow, weather)
-        self._programs, self._sky, self._shadow_triangle, self._weather = self._looks[define]
+            self._by_weather[define] = _WeatherPrograms(compiled, sky, shadow, weather)
+        self._programs, self._sky, self._shadow_triangle, self._weather = self._by_weather[define]
 
     def _array(self, program: Any, mesh: int) -> tuple[Any, Any]:
         """Return vertex array and instance buffer of a program for a mesh."""

@@ -28,7 +28,7 @@ FLAT_ROOF_Z_MIN = 0.94  # of a flat roof's normal
 SAME_ANGLE_RAD, SAME_PLACE_M = np.radians(1.0), 0.1  # surfaces that differ by less are one plane
 NUM_QUARTER_STEPS = round(np.pi / 2 / SAME_ANGLE_RAD)  # steps of SAME_ANGLE_RAD in a quarter turn
 THINNEST_M = 0.01  # half size of a flat part
-SEED_SHARE = 0.999  # of seeds, so that float32 does not round one to 1
+SEED_SHARE = 0.999  # of seeds: in the shader, 1 or more asks for the rim of a roof (shapes.HAS_RIM)
 
 
 def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.ndarray) -> LooseTriangles:

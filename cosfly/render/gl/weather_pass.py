@@ -95,6 +95,7 @@ def uniforms(params: WeatherParams) -> dict[str, Any]:
     grey = max(overcast * 0.9 + 0.1 * cloud_share, fog_share)  # share of the overcast colours
     direct = (1.0 - _step(0.25, 0.92, cloud_share)) * (1.0 - 0.92 * fog_share) * (1.0 - 0.6 * rain_share)
 
+    # Each colour is a mixture of that of the clear sky and that of the overcast one.
     clear = ClearSky.at(sun_altitude_deg)
     covered = clear.overcast_brightness * (1.0 - 0.32 * rain_share)
     lights_on = float(1.0 - _step(0.33, 0.50, clear.overcast_brightness * (1.0 - 0.30 * rain_share)))
