@@ -18,7 +18,7 @@ from cosfly.formats.people import COLORS, FIGURES, GARMENTS, GOAL_TERMS, HAIR, A
 from cosfly.formats.roi import read_roi
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
 from cosfly.geometry.goals import SIDES, SLOTS, SeenFrame, find_says, meant, words_of
-from cosfly.render.person import draw_appearance, look_alike
+from cosfly.render.person import choose_appearance, choose_look_alike
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import validated
 from specimens import change_json
@@ -122,7 +122,7 @@ def test_path_and_trace_round_trip(tmp_path, write, read, make, group):
 def test_a_drawn_person_is_read_back_as_written():
     rng = np.random.default_rng(1)
     for _ in range(200):
-        person = draw_appearance(rng)
+        person = choose_appearance(rng)
         assert validated(Appearance, asdict(person), "here") == person
         assert person.hat_color not in HAIR
 
@@ -200,8 +200,11 @@ def picture_of(columns: dict[int, int]) -> SeenFrame:
 
 def crowd(rng: np.random.Generator) -> tuple[dict[int, Appearance], SeenFrame]:
     """Draw a target, look-alikes, strangers, and one that is out of view and looks just as the target."""
-    target = draw_appearance(rng)
-    others = [look_alike(target, rng) if rng.random() < 0.5 else draw_appearance(rng) for _ in range(rng.integers(12))]
+    target = choose_appearance(rng)
+    others = [
+        choose_look_alike(target, rng) if rng.random() < 0.5 else choose_appearance(rng)
+        for _ in range(rng.integers(12))
+    ]
     people = {PERSON_ID: target, 1: target} | {65533 - i: one for i, one in enumerate(others)}
     seen = [number for number in people if number != 1]
     return people, picture_of(dict(zip(seen, rng.permutation(np.arange(1, 59))[: len(seen)].tolist(), strict=True)))

@@ -33,7 +33,7 @@ from cosfly.render.contract import (
 )
 from cosfly.render.gl import meshes as unit_meshes
 from cosfly.render.gl.people import person_parts
-from cosfly.render.person import choose_clothes, draw_appearance, dress_bystanders, figure_of
+from cosfly.render.person import choose_appearance, choose_clothes, dress_bystanders, figure_of
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import make_track_script, open_renderer, run
@@ -89,7 +89,7 @@ def test_the_figure_stands_on_the_ground_within_the_targets_box(heading, phase, 
 
 
 def test_look_alikes_differ_from_the_target_in_one_thing_and_nobody_looks_just_like_it():
-    target = draw_appearance(np.random.default_rng(1))
+    target = choose_appearance(np.random.default_rng(1))
     stands = Bystander(np.zeros((2, 3)), np.zeros(2))
     others = [replace(stands, is_look_alike=True), stands] * 20
     people = dress_bystanders(others, np.arange(2) * 0.5, target, np.random.default_rng(0)).people(target)
@@ -436,7 +436,7 @@ def test_what_a_wall_hides_is_not_said(y_m, says_legs):
     renderer.prepare(low_m, high_m)
     pose = pose_towards([0.2, y_m, 1.3], hips_m[0])
 
-    def draw(looks: Appearance, number: int) -> Frame:
+    def draw(number: int, looks: Appearance) -> Frame:
         both = {PERSON_ID: LOOKS, **people.others} | {number: looks}
         dressed = [replace(clothes, looks=one) for one in both.values()]
         bodies = [PosedPerson(hip_m, 0.0, 0.5, 1.0, one) for hip_m, one in zip(hips_m, dressed, strict=True)]

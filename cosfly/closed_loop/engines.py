@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from caption.answer_formats.formats import THEREFORE, Draft
-from caption.schema import CaptionConfig, ObservedWindow, observed_frames
+from caption.schema import CaptionConfig, ObservedFrame, ObservedWindow
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.prompts import Question, make_question
 from caption.teachers.rule_decisions import decide
@@ -27,7 +27,7 @@ from cosfly.closed_loop.settings import BASELINES, FlyConfig
 from cosfly.closed_loop.stepper import ClosedLoopTrajectory, Moment
 from cosfly.formats.captions import TOKENS
 from cosfly.formats.episodes import MOST_WORDS, Answer
-from cosfly.formats.frames import BYSTANDER_COLUMNS, FILE_NAMES, depth_file, frame_name, instance_bytes, rgb_bytes
+from cosfly.formats.frames import FILE_NAMES, depth_file, frame_name, instance_bytes, rgb_bytes
 from cosfly.formats.places import sample_id
 from cosfly.geometry.axes import wrap_deg
 from cosfly.geometry.motion import in_axes_of
@@ -44,7 +44,7 @@ from distill.inference.samples import InferConfig, Inputs
 from distill.schema import Sample
 
 DECISION_END = '",'  # behind a decision that is the first field of an answer
-NO_SET = "decision_not_in_closed_set"  # of readable answers with an unknown decision
+UNKNOWN_DECISION = "decision_not_in_closed_set"  # of readable answers with an unknown decision
 
 
 @dataclass(frozen=True)
@@ -138,16 +138,18 @@ class PromptedEngine:
     def __init__(self, cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed: int, answers: Path) -> None:
         is_local = cfg.engine == "transformers"
         model = Path(cfg.student.partition(":")[2])
-        folder = cfg.adapter or model if is_local else cfg.as_student  # with the chat format of a trained student
-        if cfg.engine == "vllm" and (model / CHAT_FORMAT_FILE).is_file():
-            folder = folder or model
+        trained = cfg.as_student  # folder with the chat format of a trained student
+        if is_local:
+            trained = cfg.adapter or model
+        elif cfg.engine == "vllm" and trained is None and (model / CHAT_FORMAT_FILE).is_file():
+            trained = model
         update: dict[str, Any] = {"teacher": "rules" if is_local else cfg.student}
-        if folder is not None:
-            update["student"] = caption.student.model_copy(update={"folder": folder})
+        if trained is not None:
+            update["student"] = caption.student.model_copy(update={"folder": trained})
         self.vocabulary = vocabulary_of(caption)
-        self.cfg = student_settings(caption.model_copy(update=update), self.vocabulary)
+        self.caption_cfg = student_settings(caption.model_copy(update=update), self.vocabulary)
         self.limit_s = cfg.answer_limit_s
-        self.num_frames = self.cfg.window.num_frames
+        self.num_frames = self.caption_cfg.window.num_frames
         self._is_rules = cfg.engine == "rules"
         self._book = AnswerBook(answers)
         self._runner = asyncio.Runner()
@@ -155,9 +157,8 @@ class PromptedEngine:
         self._open(cfg, infer, seed)
 
     def _open(self, cfg: FlyConfig, infer: InferConfig, seed: int) -> None:
-        self._opened = open_teacher(
-            self.cfg, self._book, seed, Budget(self.cfg.budget, self.cfg.most_in_flight, self._book.totals)
-        )
+        budget = Budget(self.caption_cfg.budget, self.caption_cfg.most_in_flight, self._book.totals)
+        self._opened = open_teacher(self.caption_cfg, self._book, seed, budget)
         self._teacher = self._runner.run(self._opened.__aenter__())  # open as long as the engine
         self.name = self._teacher.record.model
 
@@ -187,10 +188,10 @@ class PromptedEngine:
 
     def _read(self, text: str, question: Question, answer_s: float | None, finish_reason: str | None) -> EngineDecision:
         """Return the decision of an answer. Its words are the reasons with their slots filled, or the raw text."""
-        more = () if self.cfg.student.folder is not None else tuple(THEREFORE)
+        more = () if self.caption_cfg.student.folder is not None else tuple(THEREFORE)
         parsed = parse_answer(text, more=more, finish_reason=finish_reason)
         if parsed.coc is None:
-            answer: Answer = "invalid" if parsed.reason == NO_SET else "unreadable"
+            answer: Answer = "invalid" if parsed.reason == UNKNOWN_DECISION else "unreadable"
             return EngineDecision(answer, None, text[:MOST_WORDS], answer_s)
         draft = question.format.read(parsed.coc, question.facts)
         coc = draft.coc if isinstance(draft, Draft) else parsed.coc
@@ -201,24 +202,18 @@ class PromptedEngine:
         script = observation.simulation.script
         moments = observation.moments
         place = script.town, script.trajectory, script.variant
-        targets = [moment.target for moment in moments]
-        bystanders = [[moment.bystanders.get(BYSTANDER_COLUMNS[k]) for k in (0, 1, 4)] for moment in moments]
-        poses = ("time_s", "position_m", "rotation_deg", "target_m")
-        seen = ("in_view", "visible", "visibility")
-        frames = observed_frames(
-            *(np.array([getattr(moment, name) for moment in moments]) for name in poses),
-            np.array([target.image_uv or [math.nan] * 2 for target in targets]),
-            np.array([target.mask_bbox_2d or [math.nan] * 4 for target in targets]),
-            *(np.array([getattr(target, name) for target in targets]) for name in seen),
-            np.array([bool(target.legible) for target in targets]), *np.array(bystanders, dtype=np.float64).T,
-        )  # fmt: skip
-        folders = tuple(self._folder(place, moment) for moment in moments)
-        indices = tuple(moment.index for moment in moments)
-        name = sample_id(f"{script.trajectory}_{script.variant}", indices[-1])
         height_px, width_px, _ = moments[-1].frame.rgb.shape
-        files = (frozenset(FILE_NAMES.values()),) * len(moments)
-        window = ObservedWindow(name, *place, indices, width_px, height_px, frames, folders, files)
-        return make_question(window, self.cfg.image, self.cfg.writing, self.vocabulary)
+        window = ObservedWindow(
+            sample_id(f"{script.trajectory}_{script.variant}", moments[-1].index),
+            *place,
+            indices=tuple(moment.index for moment in moments),
+            width_px=width_px,
+            height_px=height_px,
+            frames=tuple(map(_observed, moments)),
+            frame_folders=tuple(self._folder(place, moment) for moment in moments),
+            frame_files=(frozenset(FILE_NAMES.values()),) * len(moments),
+        )
+        return make_question(window, self.caption_cfg.image, self.caption_cfg.writing, self.vocabulary)
 
     def _folder(self, place: tuple[str, str, str], moment: Moment) -> Path:
         """Write a frame for the student, remove the oldest one, and return the frame's folder."""
@@ -228,7 +223,7 @@ class PromptedEngine:
         folder = track_folder / frame_name(moment.index)
         frame = moment.frame
         if not folder.is_dir():
-            oldest = max(moment.index - self.cfg.window.num_frames, 0)
+            oldest = max(moment.index - self.caption_cfg.window.num_frames, 0)
             shutil.rmtree(track_folder / frame_name(oldest), ignore_errors=True)
             folder.mkdir(parents=True)
             (folder / FILE_NAMES["rgb"]).write_bytes(rgb_bytes(frame.rgb))
@@ -236,6 +231,20 @@ class PromptedEngine:
             name, data = depth_file(frame.depth, "png")
             (folder / name).write_bytes(data)
         return folder
+
+
+def _observed(moment: Moment) -> ObservedFrame:
+    """Return the flight data of a frame for a prompt."""
+    target = moment.target
+    bystanders = {name: math.nan if value is None else float(value) for name, value in moment.bystanders.items()}
+    return ObservedFrame(
+        time_s=moment.time_s, position_m=moment.position_m.tolist(), rotation_deg=moment.rotation_deg.tolist(),
+        target_m=moment.target_m.tolist(), target_uv=target.image_uv or [math.nan] * 2,
+        target_bbox=target.mask_bbox_2d or [math.nan] * 4, in_view=target.in_view, visible=target.visible,
+        visibility=target.visibility, legible=bool(target.legible),
+        others_in_view=bystanders.get("in_view", math.nan), other_distance_m=bystanders.get("nearest_m", math.nan),
+        alike_differences=bystanders.get("alike_differences", math.nan),
+    )  # fmt: skip
 
 
 class LocalEngine(PromptedEngine):

@@ -116,10 +116,10 @@ def figures_of(measured: Sequence[EpisodeScore], rng: np.random.Generator) -> di
     """Return all figures with intervals by bootstrap over pedestrian trajectories."""
     walks = sorted({score.walk for score in measured})
     draws = np.vstack([np.ones(len(walks)), draw_pedestrians(len(walks), RESAMPLES, rng)])  # the first: each once
-    drawn = _ratios(draws, measured, walks)
+    figures = _ratios(draws, measured, walks)
     counts = [sum(score.sums[name][1] > 0 for score in measured) for name in MEASURES]
     return {
-        name: figure_of_draws(float(drawn[0, k]), drawn[1:, k], counts[k], len(walks), CONFIDENCE)
+        name: figure_of_draws(float(figures[0, k]), figures[1:, k], counts[k], len(walks), CONFIDENCE)
         for k, name in enumerate(MEASURES)
     }
 

@@ -43,8 +43,10 @@ def observe(simulation: ClosedLoopTrajectory, now: Moment, *, depth: bool = Fals
     velocity_mps = in_axes_of(float(yaw_deg), now.velocity_mps)
     state = np.array([*velocity_mps, height_m, wrap_deg(yaw_deg), pitch_deg, now.time_s], dtype=np.float32)
     goal = words_of(("figure", *SLOTS), simulation.script.clothes.looks)["en"]
-    seen = {"rgb": now.frame.rgb, "state": np.clip(state, STATE_LOW, STATE_HIGH), "goal": goal}
-    return seen | {"depth": now.frame.depth} if depth else seen
+    observation = {"rgb": now.frame.rgb, "state": np.clip(state, STATE_LOW, STATE_HIGH), "goal": goal}
+    if depth:
+        observation["depth"] = now.frame.depth
+    return observation
 
 
 class Policy:
@@ -77,14 +79,14 @@ class Policy:
         return [self._decide(observation) for observation in observations]
 
     def _decide(self, observation: Observation) -> EngineDecision:
-        seen = observe(observation.simulation, observation.moments[-1], depth=True)
+        inputs = observe(observation.simulation, observation.moments[-1], depth=True)
         begun_s = time.monotonic()
         try:
             with _time_limit(self._limit_s):
                 if observation.episode != self._episode:
-                    self._reset(seen["goal"], self._seed)
+                    self._reset(inputs["goal"], self._seed)
                     self._episode = observation.episode
-                value = self._act(seen)
+                value = self._act(inputs)
         except _LateError:
             decision = EngineDecision("late", words=f"no answer in {self._limit_s:g} s")
         except (Exception, SystemExit) as error:

@@ -102,7 +102,8 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
         episode, i = item.payload
         record = read_episode(episode_file(flown, episode))
         number, plan = plans[record.walk]
-        begin, end = i - window.num_frames + 1, i + relabel.future_frames + 1
+        begin = i - window.num_frames + 1
+        end = i + relabel.future_frames + 1
         if begin < 0 or end > len(plan.time_s):
             return Outcome(drop_reason="walk_ends")
         flown_frames = record.frames[: i + 1]
@@ -117,25 +118,35 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
             return Outcome(drop_reason="no_path")
         planned = planned.part(number, begin, end)
         simulation = ClosedLoopTrajectory(airspace, planned, number=number, num_lead=window.num_frames)
-        moments = [*simulation.reset()]
-        while simulation.ended is None:
-            moments.append(simulation.step(PlannerEngine.to_next(simulation, moments[-1])))
-            advance()
-        if simulation.ended != "finished":
-            return Outcome(drop_reason="crashes")
-        poses = simulation.poses
-        trace = flown_trace(
-            airspace.surroundings.obstacles, np.array([moment.time_s for moment in moments]),
-            np.hstack([poses.positions_m, poses.rotations_deg]), poses.targets_m, poses.clearances_m,
-            np.array([moment.position_m[2] - moment.height_m for moment in moments]), path_id=item.item_id,
-            planner=f"replanned from frame {i} of {record.student}, round {relabel.round}", pace=record.pace,
+        trace = _fly_plan(
+            simulation, path_id=item.item_id, pace=record.pace, part_of=planned.part_of,
+            planner=f"replanned from frame {i} of {record.student}, round {relabel.round}",
             solver={"source": episode, "frame": i, "student": record.student, "round": relabel.round,
                     "decision": record.frames[i].action},
-            part_of=planned.part_of,
         )  # fmt: skip
-        return Outcome({"trace": trace.as_json()})
+        return Outcome(drop_reason="crashes") if trace is None else Outcome({"trace": trace.as_json()})
 
     return work
+
+
+def _fly_plan(simulation: ClosedLoopTrajectory, **fields: Any) -> DroneTrace | None:
+    """Fly a plan as the upper bound does; return the drone trajectory with further fields, None if it crashes."""
+    moments = [*simulation.reset()]
+    while simulation.ended is None:
+        moments.append(simulation.step(PlannerEngine.to_next(simulation, moments[-1])))
+        advance()
+    if simulation.ended != "finished":
+        return None
+    poses = simulation.poses
+    return flown_trace(
+        simulation.airspace.surroundings.obstacles,
+        time_s=np.array([moment.time_s for moment in moments]),
+        poses=np.hstack([poses.positions_m, poses.rotations_deg]),
+        targets_m=poses.targets_m,
+        clearances_m=poses.clearances_m,
+        ground_m=np.array([moment.position_m[2] - moment.height_m for moment in moments]),
+        **fields,
+    )
 
 
 def _planned_on(plan: DroneTrace, flown: Sequence[EpisodeFrame], airspace: Airspace, cfg: PlanConfig) -> DroneTrace:

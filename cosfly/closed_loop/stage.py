@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -70,7 +70,7 @@ class ClosedLoopConfig(Config):
 
 
 class OpenEpisode:
-    """An episode in progress. moments: as many as the student sees; frames: the record so far."""
+    """An episode in progress."""
 
     def __init__(
         self, episode: str, simulation: ClosedLoopTrajectory, controls: dict[str, Control], num_frames: int
@@ -80,9 +80,9 @@ class OpenEpisode:
         lead = simulation.reset()
         self.episode = episode
         self.simulation = simulation
-        self.frames = list[EpisodeFrame]()
+        self.frames = list[EpisodeFrame]()  # the record so far
         self.controller = Controller(controls, simulation.drone, lead[-1])
-        self.moments = deque(lead, num_frames)
+        self.moments = deque(lead, num_frames)  # as many as the student sees
         poses = np.hstack([plan.positions_m, plan.rotations_deg])
         motion = PlannedMotion(plan.time_s, poses, plan.rotations_deg[:, 1], plan.positions_m)
         for moment, command in zip(lead[:-1], motion.action, strict=False):
@@ -124,9 +124,8 @@ class OpenEpisode:
         self.note(last, EngineDecision("end"), None, last.clearance_m)
         return Episode(
             **shared, episode=self.episode, town=simulation.airspace.town, map_sha256=simulation.airspace.map_sha256,
-            walk=plan.path_id,
-            pace=plan.pace,
-            dt_s=simulation.dt_s, camera_px=(camera.width_px, camera.height_px), fov_deg=camera.fov_deg,
+            walk=plan.path_id, pace=plan.pace, dt_s=simulation.dt_s, camera_px=(camera.width_px, camera.height_px),
+            fov_deg=camera.fov_deg,
             drone_radius_m=simulation.drone.radius_m, ended=simulation.ended, frames=tuple(self.frames),
             num_walk_frames=len(plan.time_s) - simulation.num_lead,
         )  # fmt: skip
@@ -162,8 +161,10 @@ def run(
         if not flown:
             expected = f"at least one accepted trajectory of more than {cfg.fly.lead_frames} frames (fly.lead_frames)"
             raise stage.nothing_kept(Tally(input=len(traces), dropped=dropped), expected=expected)
+        # Neighbours in one batch share the lit area of the renderer.
         ordered = sorted(flown, key=lambda n: (Airspace.area_of(traces[n].targets_m), n))
-        episodes = [(traces[n].path_id, n, len(_cut(traces[n], cfg.fly).time_s) - cfg.fly.lead_frames) for n in ordered]
+        num_frames = {n: len(_cut(traces[n], cfg.fly).time_s) for n in flown}
+        episodes = [ListedEpisode(traces[n].path_id, n, num_frames[n] - cfg.fly.lead_frames) for n in ordered]
         batch = min(cfg.fly.batch, math.ceil(len(flown) / num_workers))
         start = partial(open_map, cfg, seed, boxes, simplified, plans, others)
         fly_episodes(stage, cfg, [episodes], batch, start, seed, num_workers, watch)
@@ -174,23 +175,32 @@ def run(
     return out
 
 
+class ListedEpisode(NamedTuple):
+    """An episode to fly."""
+
+    name: str
+    argument: Any  # of the EpisodeOpener
+    num_steps: int
+
+
 def fly_episodes(
-    stage: StageFolder, cfg: ClosedLoopConfig, groups: Sequence[Sequence[tuple[str, Any, int]]], batch: int,
+    stage: StageFolder, cfg: ClosedLoopConfig, groups: Sequence[Sequence[ListedEpisode]], batch: int,
     start: Callable[[], EpisodeOpener], seed: int, num_workers: int, watch: Watch, list_sha256: str | None = None,
 ) -> None:  # fmt: skip
     """Fly episodes to their ends and write each record; episodes with a record are skipped.
 
     Args:
-        groups: Episodes that may be in one batch, each as its id, the argument that opens it, and its number of steps.
+        groups: Episodes that may be in one batch.
         batch: Number of episodes that a worker flies at once.
-        start: A partial of a module-level function, which a worker calls once to get what opens an episode.
+        start: A partial of a module-level function, which a worker calls once to get its EpisodeOpener.
     """
     items = []
     for group in groups:
         for begin in range(0, len(group), batch):
-            names, arguments, steps = zip(*group[begin : begin + batch], strict=True)
-            payload = dict(zip(names, arguments, strict=True))
-            items.append(Item(f"{names[0]} and {len(names) - 1}", payload, sum(steps)))
+            episodes = group[begin : begin + batch]
+            payload = {episode.name: episode.argument for episode in episodes}
+            num_steps = sum(episode.num_steps for episode in episodes)
+            items.append(Item(f"{episodes[0].name} and {len(episodes) - 1}", payload, num_steps))
     worker_args = (cfg, start, stage.path, seed, num_workers, list_sha256)
     run_items(stage, items, make_worker, worker_args, workers=num_workers, watch=watch_of(cfg.fly, watch))
 
@@ -222,9 +232,9 @@ def make_worker(
             for episode, decision in zip(active, engine.decide(observations), strict=True):
                 episode.step(decision)
                 advance()
-            for episode in [episode for episode in active if episode.simulation.ended is not None]:
-                write_episode(episode_file(out, episode.episode), episode.record(shared))
-                active.remove(episode)
+                if episode.simulation.ended is not None:
+                    write_episode(episode_file(out, episode.episode), episode.record(shared))
+            active = [episode for episode in active if episode.simulation.ended is None]
         return Outcome({"flights": list(item.payload)})
 
     return work
@@ -272,15 +282,16 @@ def open_map(
     """Open a renderer of a map in this process; return the function that opens the episode of a plan's index."""
     traces = read_traces(plans)
     bystanders, num_others = rendering.bystanders_of(others, traces)
-    drawn, obstacles = read_boxes(boxes), read_boxes(simplified)
-    airspace = Airspace(cfg.render, drawn, obstacles, map_sha256=sha256_file(boxes), seed=seed, num_others=num_others)
+    airspace = Airspace(
+        cfg.render, read_boxes(boxes), read_boxes(simplified), map_sha256=sha256_file(boxes), seed=seed,
+        num_others=num_others,
+    )  # fmt: skip
 
     def open_episode(n: int) -> ClosedLoopTrajectory:
-        plan, fly = traces[n], cfg.fly
-        other = bystanders.get(plan.path_id, ())
         return ClosedLoopTrajectory(
-            airspace, _cut(plan, fly), number=n, num_lead=fly.lead_frames, lost_s=fly.lost_s, others=other
-        )
+            airspace, _cut(traces[n], cfg.fly), number=n, num_lead=cfg.fly.lead_frames, lost_s=cfg.fly.lost_s,
+            others=bystanders.get(traces[n].path_id, ()),
+        )  # fmt: skip
 
     return open_episode
 

@@ -109,8 +109,16 @@ class Moment:
 
 
 class ClosedLoopTrajectory:
-    """One episode behind one pedestrian. `reset` returns the lead frames; `step` flies a command for one time step and
-    returns the next frame. `ended` is None until the episode ends. `script` describes what is drawn."""
+    """One episode behind one pedestrian.
+
+    `reset` returns the lead frames; `step` flies a command for one time step and returns the next frame.
+    """
+
+    poses: Poses  # up to `index` those of the episode, then still those of the plan
+    index: int  # of the present frame
+    ended: Ended | None  # None until the episode ends
+    velocity_mps: np.ndarray  # (3,) world
+    yaw_rate_degps: float
 
     def __init__(
         self, airspace: Airspace, planned: DroneTrace, *, number: int = 0, num_lead: int = 5, drone: Drone = Drone(),
@@ -143,10 +151,10 @@ class ClosedLoopTrajectory:
         last = self.num_lead - 1
         flown = Poses(planned.positions_m, planned.rotations_deg, planned.targets_m, planned.clearances_m)
         self.script = replace(self.script, perturbed=PerturbedTrack.unperturbed(flown))  # which copies the poses
-        self.poses = self.script.perturbed.poses  # up to `index` those of the episode, then still those of the plan
+        self.poses = self.script.perturbed.poses
         self.index = last
         self._unseen_s = 0.0
-        self.ended: Ended | None = None
+        self.ended = None
         self.velocity_mps = (flown.positions_m[last] - flown.positions_m[last - 1]) / self.dt_s
         turned_deg = wrap_deg(flown.rotations_deg[last, 1] - flown.rotations_deg[last - 1, 1])
         self.yaw_rate_degps = float(turned_deg) / self.dt_s
@@ -155,10 +163,10 @@ class ClosedLoopTrajectory:
         """Start from the beginning; return the last `num_drawn` lead frames (None: all) up to the present one."""
         self._begin()
         first = 0 if num_drawn is None else self.num_lead - num_drawn
-        steps = np.diff(self.poses.positions_m[: self.num_lead], axis=0) / self.dt_s
-        velocities = [steps[0], *steps]
+        step_velocities = np.diff(self.poses.positions_m[: self.num_lead], axis=0) / self.dt_s
+        velocities_mps = [step_velocities[0], *step_velocities]
         return tuple(
-            self._drawn(i, velocities[i], float(self.poses.clearances_m[i])) for i in range(first, self.num_lead)
+            self._drawn(i, velocities_mps[i], float(self.poses.clearances_m[i])) for i in range(first, self.num_lead)
         )
 
     def step(self, command: np.ndarray) -> Moment:
@@ -183,16 +191,19 @@ class ClosedLoopTrajectory:
         self.poses.clearances_m[i - 1 : i + 1] = clearance_m
         moment = self._drawn(i, self.velocity_mps.copy(), clearance_m)
         self._unseen_s = 0.0 if moment.target.visible else self._unseen_s + self.dt_s
+        self.ended = self._end_at(path_m[-1], clearance_m)
+        return moment
+
+    def _end_at(self, position_m: np.ndarray, clearance_m: float) -> Ended | None:
+        """Return why the episode ends at the present frame; None if it goes on."""
         low, high = self.airspace.bounds_m
         if clearance_m < self.drone.radius_m:
-            self.ended = "crashed"
-        elif (np.maximum(low - path_m[-1], path_m[-1] - high)[:2] > LEAVES_M).any():
-            self.ended = "left"
-        elif i == len(self.planned.time_s) - 1:
-            self.ended = "finished"
-        elif self.lost_s and self._unseen_s >= self.lost_s:
-            self.ended = "lost"
-        return moment
+            return "crashed"
+        if (np.maximum(low - position_m, position_m - high)[:2] > LEAVES_M).any():
+            return "left"
+        if self.index == len(self.planned.time_s) - 1:
+            return "finished"
+        return "lost" if self.lost_s and self._unseen_s >= self.lost_s else None
 
     def _path(self, command: np.ndarray) -> tuple[np.ndarray, float, float]:
         """Return the positions within one step, (k + 1, 3), and yaw and pitch at its end, degrees."""

@@ -191,6 +191,15 @@ def hardest_begin(plan: DroneTrace, solids: BoxIndex) -> int:
     return hardest
 
 
+def _takeover_after_loss(plan: DroneTrace) -> int | None:
+    """Return the point where a policy takes over after the plan lost the target; None if there is none late enough."""
+    if plan.instead_of:
+        return None
+    dt_s = float(plan.time_s[1])
+    lost = first_loss(plan.visibility, dt_s, AFTER_LOSS * dt_s)
+    return lost + AFTER_LOSS if lost is not None and lost + AFTER_LOSS > LEAD_FRAMES // 2 else None
+
+
 @lru_cache(maxsize=256)
 def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisode | None:
     """Return the episode of a town's trajectory; None if it or its plan is unsuitable. The last ones are cached."""
@@ -208,17 +217,15 @@ def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisod
     begin = 0
     num_lead = LEAD_FRAMES
     rotations_deg = plan.rotations_deg.copy()
-    if task == REACQUIRES:
-        dt_s = float(plan.time_s[1])
-        lost = None if plan.instead_of else first_loss(plan.visibility, dt_s, AFTER_LOSS * dt_s)
-        if lost is not None and lost + AFTER_LOSS > LEAD_FRAMES // 2:
-            num_lead = min(lost + AFTER_LOSS, LEAD_FRAMES)
-            begin = lost + AFTER_LOSS - num_lead
-        else:
-            rotations_deg[:num_lead, 1] += float(rng_for(town.seed, "reacquire", name).uniform(*TURNED_DEG))
-    else:
+    if task != REACQUIRES:
         begin = hardest_begin(plan, world.solids)
-    if len(plan.time_s) < (end := begin + num_lead + NUM_DECISIONS):
+    elif (takeover := _takeover_after_loss(plan)) is not None:
+        num_lead = min(takeover, LEAD_FRAMES)
+        begin = takeover - num_lead
+    else:
+        rotations_deg[:num_lead, 1] += float(rng_for(town.seed, "reacquire", name).uniform(*TURNED_DEG))
+    end = begin + num_lead + NUM_DECISIONS
+    if len(plan.time_s) < end:
         return None
     plan = replace(plan.part(number, begin, end), rotations_deg=rotations_deg[begin:end])
     plan = replace(plan, time_s=plan.time_s - plan.time_s[0])
@@ -226,9 +233,9 @@ def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisod
     if cfg.others:
         rng = rng_for(town.seed, "pedestrians", f"{name}/others")
         positions_m = target.positions_m[begin:end]
-        met = replace(
+        cut_target = replace(
             target, polyline_m=positions_m[:, :2], time_s=plan.time_s, positions_m=positions_m,
             speeds_mps=target.speeds_mps[begin:end],
         )  # fmt: skip
-        bystanders = tuple(bystanders_of(met, world.ground, cfg, rng).others)
+        bystanders = tuple(bystanders_of(cut_target, world.ground, cfg, rng).others)
     return BenchmarkEpisode(task, world, number, plan, num_lead, bystanders)

@@ -56,6 +56,9 @@ class FollowEnv(gymnasium.Env):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012
+    # Set by `reset`:
+    _now: Moment  # the present frame
+    _controller: Controller
 
     def __init__(
         self, task: str, *, actions: str = "decisions", observation: str = "words", episodes: str = "train",
@@ -92,30 +95,37 @@ class FollowEnv(gymnasium.Env):
         self._controls = read_controls()
         low, high = (bound.astype(np.float32) for bound in self.drone.bounds)
         self.action_space = spaces.Discrete(len(TOKENS)) if actions == "decisions" else spaces.Box(low, high)
-        width_px, height_px = self.size_px
-        observed: dict[str, spaces.Space] = {
-            "rgb": spaces.Box(0, 255, (height_px, width_px, 3), np.uint8),
-            "state": spaces.Box(STATE_LOW, STATE_HIGH),
-            "goal": spaces.Text(200, charset=GOAL_CHARACTERS),
-        }
-        if depth:
-            observed["depth"] = spaces.Box(0.0, FAR_M, (height_px, width_px), np.float32)
-        if observation != "words":
-            observed["goal"] = spaces.MultiDiscrete([len(choices) for choices in LOOKS.values()])
-        self._seen = spaces.Dict(observed)
-        self._flat = None
-        self.observation_space: spaces.Space = self._seen
+        self._dict_space = self._make_dict_space(in_words=observation == "words")
+        self._flat_space = None
+        self.observation_space: spaces.Space = self._dict_space
         if observation == "flat":
-            self._flat = cast(spaces.Box, spaces.flatten_space(self._seen))
-            self.observation_space = spaces.Box(0.0, 1.0, self._flat.shape)
+            self._flat_space = cast(spaces.Box, spaces.flatten_space(self._dict_space))
+            self.observation_space = spaces.Box(0.0, 1.0, self._flat_space.shape)
         self._airspaces = dict[str, Airspace]()  # of the towns seen so far, in one GL context
         self._episode: BenchmarkEpisode | None = None
         self._simulation: ClosedLoopTrajectory | None = None
 
+    def _make_dict_space(self, *, in_words: bool) -> spaces.Dict:
+        """Return the space of observations that are not flat; in_words: the goal is a text."""
+        width_px, height_px = self.size_px
+        space: dict[str, spaces.Space] = {
+            "rgb": spaces.Box(0, 255, (height_px, width_px, 3), np.uint8),
+            "state": spaces.Box(STATE_LOW, STATE_HIGH),
+            "goal": spaces.Text(200, charset=GOAL_CHARACTERS),
+        }
+        if self.has_depth:
+            space["depth"] = spaces.Box(0.0, FAR_M, (height_px, width_px), np.float32)
+        if not in_words:
+            space["goal"] = spaces.MultiDiscrete([len(choices) for choices in LOOKS.values()])
+        return spaces.Dict(space)
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
         """Start an episode: that of index options["episode"] in the list, or a random one."""
         super().reset(seed=seed)
-        if self.listed is not None:
+        if self.listed is None:
+            town = benchmark.TRAINING[self.towns[int(self.np_random.integers(len(self.towns)))]]
+            numbers = self.np_random.integers(100_000, size=benchmark.TRIES).tolist()
+        else:
             index = (options or {}).get("episode")
             if index is None:
                 index = int(self.np_random.integers(len(self.listed)))
@@ -127,10 +137,8 @@ class FollowEnv(gymnasium.Env):
                     expected=f"a whole number from 0 to {len(self.listed) - 1}",
                 )
             name, number = self.listed[index]
-            town, numbers = benchmark.HELD_OUT[name], [number]
-        else:
-            town = benchmark.TRAINING[self.towns[int(self.np_random.integers(len(self.towns)))]]
-            numbers = self.np_random.integers(100_000, size=benchmark.TRIES).tolist()
+            town = benchmark.HELD_OUT[name]
+            numbers = [number]
         world = world_of(town)
         if not any(self._begin(benchmark.episode_of(self.task, world, number)) for number in numbers):
             raise InputError(
@@ -160,18 +168,7 @@ class FollowEnv(gymnasium.Env):
         """Fly an action for 0.5 s; an episode that crashed or left the map is terminated, a finished one truncated."""
         if self._simulation is None or self._simulation.ended is not None:
             raise InputError("no episode is running", where=self.task, fix="call reset before step")
-        space = self.action_space
-        with contextlib.suppress(TypeError, ValueError):  # of what is no number
-            value = np.asarray(action)
-            if isinstance(space, spaces.Box):
-                action = value.astype(space.dtype)
-            elif value.size == 1 and np.issubdtype(value.dtype, np.integer):
-                action = value.reshape(())[()]
-        if not space.contains(action):
-            got, expected = repr(action)[:120], repr(space)
-            raise InputError(
-                "the action is not in the action space of the environment", where=self.task, got=got, expected=expected
-            )
+        action = self._checked(action)
         if isinstance(self.action_space, spaces.Discrete):
             command = self._controller.command(TOKENS[int(action)], self._now)
         else:
@@ -181,15 +178,29 @@ class FollowEnv(gymnasium.Env):
         reward = reward_of(self._now, ended)
         return self._observation(), reward, ended in ("crashed", "left"), ended == "finished", self._info()
 
+    def _checked(self, action: Any) -> Any:
+        """Return an action in the type of the action space; raise InputError if the space does not contain it."""
+        space = self.action_space
+        with contextlib.suppress(TypeError, ValueError):  # if it is not a number
+            value = np.asarray(action)
+            if isinstance(space, spaces.Box):
+                action = value.astype(space.dtype)
+            elif value.size == 1 and np.issubdtype(value.dtype, np.integer):
+                action = value.reshape(())[()]
+        if not space.contains(action):
+            what = "the action is not in the action space of the environment"
+            raise InputError(what, where=self.task, got=repr(action)[:120], expected=repr(space))
+        return action
+
     def _observation(self) -> Any:
         assert self._simulation is not None
-        seen = observe(self._simulation, self._now, depth=self.has_depth)
-        if not isinstance(self._seen["goal"], spaces.Text):
-            seen["goal"] = looks_numbers(self._simulation.script.clothes.looks)
-        if self._flat is None:
-            return seen
-        low, high = self._flat.low, self._flat.high
-        values = cast(np.ndarray, spaces.flatten(self._seen, seen))
+        observation = observe(self._simulation, self._now, depth=self.has_depth)
+        if not isinstance(self._dict_space["goal"], spaces.Text):
+            observation["goal"] = looks_numbers(self._simulation.script.clothes.looks)
+        if self._flat_space is None:
+            return observation
+        low, high = self._flat_space.low, self._flat_space.high
+        values = cast(np.ndarray, spaces.flatten(self._dict_space, observation))
         return ((values - low) / (high - low)).astype(np.float32)
 
     def _info(self) -> dict[str, Any]:

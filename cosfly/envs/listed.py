@@ -6,7 +6,7 @@ from itertools import groupby
 from pathlib import Path
 
 from cosfly.closed_loop.settings import CONTROLLER_FILE
-from cosfly.closed_loop.stage import ClosedLoopConfig, EpisodeOpener, finish_episodes, fly_episodes
+from cosfly.closed_loop.stage import ClosedLoopConfig, EpisodeOpener, ListedEpisode, finish_episodes, fly_episodes
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory
 from cosfly.envs import episodes as benchmark
 from cosfly.runtime.errors import InputError
@@ -27,13 +27,16 @@ def run(cfg: ListConfig, out: Path, *, seed: int = 0, workers: int = 1, watch: W
     stage = StageFolder.open(out, "fly", config=cfg, inputs={}, seed=seed, package_files=files)
     if not stage.is_complete:
         num_decisions = cfg.fly.most_decisions or benchmark.NUM_DECISIONS
-        flown = [(benchmark.episode_id(*episode), episode, num_decisions) for episode in episodes]
-        # A model answers all towns as one batch; otherwise a worker opens one town at a time.
-        groups = [flown] if cfg.fly.asks_model else [list(own) for _, own in groupby(flown, key=lambda one: one[1][0])]
-        num_workers = 1 if cfg.fly.asks_model else workers
-        start = partial(open_towns, task, len(benchmark.HELD_OUT) if cfg.fly.asks_model else 1, num_decisions)
+        flown = [ListedEpisode(benchmark.episode_id(*episode), episode, num_decisions) for episode in episodes]
+        # A worker opens one town at a time. But a model answers all towns as one batch.
+        groups = [list(of_town) for _, of_town in groupby(flown, key=lambda listed: listed.argument[0])]
+        num_open, num_workers = 1, workers
+        if cfg.fly.asks_model:
+            groups = [flown]
+            num_open, num_workers = len(benchmark.HELD_OUT), 1
+        start = partial(open_towns, task, num_open, num_decisions)
         fly_episodes(stage, cfg, groups, cfg.fly.batch, start, seed, num_workers, watch, digest)
-        finish_episodes(stage, cfg.fly, seed, [name for name, *_ in flown])
+        finish_episodes(stage, cfg.fly, seed, [listed.name for listed in flown])
     return out
 
 

@@ -3,8 +3,11 @@
 `past_of` makes a row of numbers from a window; a network and a decision tree (the rule) are fitted on such rows.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,8 +23,15 @@ ROUNDS = 120  # iterations of its optimiser
 PENALTY = 1e-3  # on the squares of its weights
 STANDS_MPS = 0.2  # below this speed the target stands
 Decider = Callable[[np.ndarray], np.ndarray]  # pasts (n, d) -> numbers of decisions (n,)
-# A decision's number; or a column, its threshold, the rule for values up to the threshold, and the rule above it.
-Rule = int | tuple[int, float, "Rule", "Rule"]
+
+
+class Split(NamedTuple):
+    """A node of a decision tree; a leaf is the number of a decision."""
+
+    column: int
+    threshold: float
+    low: Split | int  # the rule for values up to the threshold
+    high: Split | int
 
 
 def past_of(track: Track, window: Sequence[int], is_ordered: bool) -> np.ndarray:
@@ -38,8 +48,8 @@ def past_of(track: Track, window: Sequence[int], is_ordered: bool) -> np.ndarray
     yaw_deg = float(rotations_deg[-1, 1])
     drone_m = in_axes_of(yaw_deg, positions_m - positions_m[-1])
     is_seen = (track.target.visible & track.target.in_view)[frames]
-    targets_m = np.where(is_seen[:, None], track.targets_m[frames], np.nan)
-    target_m = in_axes_of(yaw_deg, targets_m - positions_m[-1])
+    seen_targets_m = np.where(is_seen[:, None], track.targets_m[frames], np.nan)
+    target_m = in_axes_of(yaw_deg, seen_targets_m - positions_m[-1])
     step_s = np.diff(track.time_s[frames])[:, None]
     step_s[step_s == 0] = np.nan  # a repeated frame
     drone_mps = np.diff(drone_m, axis=0) / step_s
@@ -116,7 +126,7 @@ def fit_deciders(table: np.ndarray, labels: np.ndarray, rng: np.random.Generator
     return deciders
 
 
-def fit_rule(table: np.ndarray, labels: np.ndarray, depth: int = 2) -> Rule:
+def fit_rule(table: np.ndarray, labels: np.ndarray, depth: int = 2) -> Split | int:
     """Fit a decision tree, as `fit_network`, with the threshold of the least Gini impurity at each node."""
     counts = np.bincount(labels)
     if depth == 0 or (counts > 0).sum() < 2:
@@ -138,12 +148,11 @@ def fit_rule(table: np.ndarray, labels: np.ndarray, depth: int = 2) -> Rule:
     _, column, threshold = best
     is_low = table[:, column] <= threshold
     low, high = (fit_rule(table[rows], labels[rows], depth - 1) for rows in (is_low, ~is_low))
-    return column, threshold, low, high
+    return Split(column, threshold, low, high)
 
 
-def decide(rule: Rule, row: np.ndarray) -> int:
+def decide(rule: Split | int, row: np.ndarray) -> int:
     """Apply a rule to a row of numbers, and return the number of its decision."""
-    while isinstance(rule, tuple):
-        column, threshold, low, high = rule
-        rule = low if row[column] <= threshold else high
+    while isinstance(rule, Split):
+        rule = rule.low if row[rule.column] <= rule.threshold else rule.high
     return rule

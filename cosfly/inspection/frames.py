@@ -1,12 +1,13 @@
 """Checks of the files and pictures of one track: they exist, match their digests, decode, and agree with the poses and
 with each other.
 
-Issues go into a Report, figures into FrameNumbers; the thresholds of acceptance are in track.py.
+Issues go into a Report, figures into FrameNumbers, which track.py compares with its thresholds.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -56,16 +57,18 @@ def check_files(track: Track, report: Report) -> dict[int, FrameMeta | None]:
     assert track.folder is not None
     complete: dict[int, FrameMeta | None] = {}
     folders = [track.frame_folder(i) for i in range(len(track))]
-    absent = [name for name in FRAME_FILES[1:] if not any(frame_path(folder, name).exists() for folder in folders)]
-    if absent and _lists(track.folder, absent):
-        absent = []
-    for name in absent:
+    foreign = [name for name in FRAME_FILES[1:] if not any(frame_path(folder, name).exists() for folder in folders)]
+    if foreign and _lists(track.folder, foreign):
+        foreign = []  # then the files are missing
+    for name in foreign:
         where = f"{FRAMES_DIR}/*/{name}"
         report.add("note", "not_in_this_tree", where, "no such file", "one per frame in cosfly's trees")
     for i, folder in enumerate(folders):
         num_issues = len(report.issues)
         meta = None
-        for name in (name for name in FRAME_FILES if name not in absent):
+        for name in FRAME_FILES:
+            if name in foreign:
+                continue
             path = frame_path(folder, name)
             where = f"{frame_name(i)}/{path.name}"
             if not path.is_file():
@@ -75,9 +78,9 @@ def check_files(track: Track, report: Report) -> dict[int, FrameMeta | None]:
         if len(report.issues) == num_issues:
             complete[i] = meta
     frames = track.folder / FRAMES_DIR
-    frame_names = {folder.name for folder in folders}
-    for stray in sorted(p.name for p in frames.iterdir() if p.name not in frame_names) if frames.is_dir() else []:
-        report.warn("stray_frame", f"{FRAMES_DIR}/{stray}", "no point of this index", f"{len(frame_names)} frames")
+    found = {path.name for path in frames.iterdir()} if frames.is_dir() else set()
+    for stray in sorted(found - {folder.name for folder in folders}):
+        report.warn("stray_frame", f"{FRAMES_DIR}/{stray}", "no point of this index", f"{len(track)} frames")
     return complete
 
 
@@ -131,9 +134,18 @@ USUAL_AGREE = 0.8  # share of points that agree in most pairs of a consistent tr
 ROUGH_ERROR = 1e-3  # largest usual error of planes, as a share of the depth
 
 
-def _view(track: Track, i: int, picture: Picture) -> View:
+class _Surfaces(NamedTuple):
+    """The surfaces that a frame shows."""
+
+    frame: int
+    view: View
+    lens: np.ndarray  # (4,) focal lengths and principal point, px
+
+
+def _surfaces(track: Track, i: int, picture: Picture) -> _Surfaces:
     pose = world_from_camera(track.positions_m[i], track.rotations_deg[i])
-    return View(picture.depth, picture.instance, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy())
+    view = View(picture.depth, picture.instance, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy())
+    return _Surfaces(i, view, track.camera_at(i).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]])
 
 
 def _report_jumps(track: Track, pairs: dict[int, Agreement], report: Report) -> int:
@@ -202,12 +214,15 @@ BLANK_STD = 2.0  # grey levels; a frame of one colour has 0, fog over a street m
 # The centre of the target's box is at most half its height from its visible surface along the optical axis.
 SURFACE_TOLERANCE_M = PERSON_HALF_EXTENTS_M[2] + 0.3
 MASK_MIN_BOX_PX2 = 24.0  # a smaller box may contain no pixel centre of the target
+# A camera that moved or turned farther between two frames cannot give equal pictures.
+MOVED_M, TURNED_DEG = 0.5, 2.0
 
 
 @dataclass
 class FrameNumbers:
     """Figures of the pixels of one track."""
 
+    read_files: set[str] = field(default_factory=set)  # names in the track's folder; their digests were compared
     num_checked: int = 0
     num_compared: int = 0  # with the previous frame
     track_ious: list[float] = field(default_factory=list)  # of the frames that show the target
@@ -219,65 +234,85 @@ def check_frames(
 ) -> FrameNumbers:
     """Decode frames; compare colour, depth and mask with each other, the poses and the previous frame.
 
-    Each file is read once and compared with its digest, which is removed from `digests`.
+    Each file is read once, and compared with its digest if `digests` contains one.
     """
     numbers = FrameNumbers()
-    jumps = dict[int, Agreement]()
-    previous: tuple[int, np.ndarray] | None = None
-    surfaces: tuple[int, View] | None = None  # of the previous frame with depth
-    size = track.camera.width_px, track.camera.height_px
+    agreements = dict[int, Agreement]()
+    previous_small: _SmallPicture | None = None
+    previous_surfaces: _Surfaces | None = None  # of the last frame with depth
     for i in indices:
         advance()
-        where = frame_name(i)
-        try:
-            files = _read(track, i, digests, report)
-            if (found := png_size(files["rgb.png"])) != size:
-                report.error("wrong_format", f"{where}/rgb.png", str(found or "no PNG header"), str(size))
-                continue
-            picture = unpack(files, Path(where))
-        except InputError as error:
-            report.error("broken_image", str(error.where), f"{error.what}: {error.got}", "a file that decodes in full")
+        picture = _read_picture(track, i, digests, numbers, report)
+        if picture is None:
             continue
         numbers.num_checked += 1
-        small = cv2.resize(picture.colours[::SMALL_ROWS], SMALL_PX, interpolation=cv2.INTER_AREA)
-        if small.std() < BLANK_STD:
-            report.error("blank_frame", f"{where}/rgb.png", f"standard deviation {small.std():.2f}", "a picture")
-        if previous is not None and (previous[1] == small).all() and _moved(track, previous[0], i):
-            got = f"the picture of frame {previous[0]}"
-            report.error("frozen_frame", f"{where}/rgb.png", got, "a different picture, because the camera has moved")
-        previous = (i, small)
+        small = _SmallPicture(i, cv2.resize(picture.colours[::SMALL_ROWS], SMALL_PX, interpolation=cv2.INTER_AREA))
+        _check_colours(track, small, previous_small, report)
+        previous_small = small
         is_bystander = np.zeros(NUM_IDS, dtype=np.bool_)
-        others = bystanders[i].others if i in bystanders else ()
-        is_bystander[[other.instance_id for other in others if other.instance_id < NUM_IDS]] = True
+        people = bystanders[i].others if i in bystanders else ()
+        is_bystander[[person.instance_id for person in people if person.instance_id < NUM_IDS]] = True
         figures = measure_pixels(picture, is_bystander, limits.FLAT_PAIRS_MIN)
-        _check_surfaces(figures, where, report)
-        if picture.depth.size and _check_depth(picture.depth, _depth_place(track, i), numbers, report):
-            view = _view(track, i, picture)
-            if surfaces is not None and i - surfaces[0] <= NEAR_FRAMES:
-                k, before = surfaces
-                intrinsics = [track.camera_at(j).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]] for j in (k, i)]
-                jumps[i] = compare_views(before, view, *intrinsics)
-            surfaces = (i, view)
-            if picture.instance.size:
-                _check_mask(track, i, picture, figures, is_bystander, numbers, report)
-    numbers.num_compared = _report_jumps(track, jumps, report)
+        _check_surfaces(figures, frame_name(i), report)
+        if not picture.depth.size or not _check_depth(picture.depth, _depth_place(track, i), numbers, report):
+            continue
+        surfaces = _surfaces(track, i, picture)
+        before = previous_surfaces
+        if before is not None and i - before.frame <= NEAR_FRAMES:
+            agreements[i] = compare_views(before.view, surfaces.view, before.lens, surfaces.lens)
+        previous_surfaces = surfaces
+        if picture.instance.size:
+            _check_mask(track, i, picture, figures, is_bystander, numbers, report)
+    numbers.num_compared = _report_jumps(track, agreements, report)
     return numbers
 
 
-def _read(track: Track, i: int, digests: dict[str, str], report: Report) -> dict[str, bytes]:
-    """Read the existing pictures of a frame; `check_files` reports missing ones."""
+def _read_picture(
+    track: Track, i: int, digests: dict[str, str], numbers: FrameNumbers, report: Report
+) -> Picture | None:
+    """Read and decode the existing pictures of a frame; report what is wrong with them, and return None."""
     assert track.folder is not None
     folder = track.frame_folder(i)
     tree = tree_of_track(track.folder)
-    files = dict[str, bytes]()
-    for name in FILE_NAMES.values():
-        if (path := frame_path(folder, name)).exists():
-            data = files[path.name] = read_bytes(path, what="image", tree=tree)
-            where = f"{frame_name(i)}/{path.name}"
-            digest = digests.pop(where, None)
-            if digest is not None and sha256_bytes(data) != digest:
-                report.error("checksum", where, "other bytes", f"the digest in {CHECKSUMS}")
-    return files
+    contents = dict[str, bytes]()
+    size = track.camera.width_px, track.camera.height_px
+    try:
+        for path in (frame_path(folder, name) for name in FILE_NAMES.values()):
+            if not path.exists():
+                continue  # `check_files` reports missing ones
+            name = f"{frame_name(i)}/{path.name}"
+            contents[path.name] = read_bytes(path, what="image", tree=tree)
+            numbers.read_files.add(name)
+            if name in digests and sha256_bytes(contents[path.name]) != digests[name]:
+                report.error("checksum", name, "other bytes", f"the digest in {CHECKSUMS}")
+        if (found := png_size(contents["rgb.png"])) != size:
+            report.error("wrong_format", f"{frame_name(i)}/rgb.png", str(found or "no PNG header"), str(size))
+            return None
+        return unpack(contents, Path(frame_name(i)))
+    except InputError as error:
+        report.error("broken_image", str(error.where), f"{error.what}: {error.got}", "a file that decodes in full")
+        return None
+
+
+class _SmallPicture(NamedTuple):
+    """The reduced colours of a frame."""
+
+    frame: int
+    pixels: np.ndarray  # (72, 128, 3) uint8
+
+
+def _check_colours(track: Track, small: _SmallPicture, previous: _SmallPicture | None, report: Report) -> None:
+    """Report a picture of one colour, and one that equals the previous picture although the camera has moved."""
+    where = f"{frame_name(small.frame)}/rgb.png"
+    if small.pixels.std() < BLANK_STD:
+        report.error("blank_frame", where, f"standard deviation {small.pixels.std():.2f}", "a picture")
+    if previous is None or (previous.pixels != small.pixels).any():
+        return
+    shift_m = np.linalg.norm(track.positions_m[small.frame] - track.positions_m[previous.frame])
+    turn_deg = np.abs(track.rotations_deg[small.frame] - track.rotations_deg[previous.frame]).max()
+    if shift_m > MOVED_M or turn_deg > TURNED_DEG:
+        got = f"the picture of frame {previous.frame}"
+        report.error("frozen_frame", where, got, "a different picture, because the camera has moved")
 
 
 def _check_surfaces(figures: PixelFigures, where: str, report: Report) -> None:
@@ -293,13 +328,6 @@ def _check_surfaces(figures: PixelFigures, where: str, report: Report) -> None:
     if figures.fighting > limits.Z_FIGHTING_MAX:
         got = f"{figures.fighting:.3%} of the pixels alternate between two surfaces of one plane"
         report.warn("z_fighting", f"{where}/instance.png", got, f"at most {limits.Z_FIGHTING_MAX:.3%}")
-
-
-def _moved(track: Track, i: int, k: int) -> bool:
-    """Return whether the camera moved so far between two frames that equal pictures are an error."""
-    shift_m = np.linalg.norm(track.positions_m[k] - track.positions_m[i])
-    turn_deg = np.abs(track.rotations_deg[k] - track.rotations_deg[i]).max()
-    return bool(shift_m > 0.5 or turn_deg > 2.0)
 
 
 def _depth_place(track: Track, i: int) -> str:
@@ -338,35 +366,52 @@ def _check_mask(
     visibility = track.target.visibility[i]
     if np.isnan(box).any() or not visibility > 0:
         return
-    where = f"{frame_name(i)}/instance.png"
-    region = None
-    x0, y0, x1, y1 = people = figures.person_box or (0, 0, 0, 0)
-    corner = np.array([x0, y0, x0, y0], dtype=np.float64)
-    if figures.person_box is not None:
-        instance = picture.instance[y0:y1, x0:x1]
-        ids = instance[..., 1].astype(np.uint16) | (instance[..., 2].astype(np.uint16) << 8)
-        region = pedestrian_region(np.where(is_bystander[ids], KINDS["NONE"], instance[..., 0]), box - corner)
-    if region is None:
+    pixels = _target_pixels(picture, figures, is_bystander, box)
+    if pixels is None or figures.person_box is None:
         area_px2 = (box[2] - box[0]) * (box[3] - box[1])
         if visibility >= limits.MASK_VISIBILITY_MIN and area_px2 >= MASK_MIN_BOX_PX2:
             got = f"no pedestrian pixel at the target's box, visibility {visibility:.2f}"
+            where = f"{frame_name(i)}/instance.png"
             report.error("mask_disagrees", where, got, "pedestrian pixels at the projected target")
         numbers.track_ious.append(0.0)
         return
-    mask_px = mask_box(region) + corner
     # A tolerance of half a pixel at each edge.
-    numbers.track_ious.append(box_iou(np.clip(mask_px, box - 0.5, box + 0.5), mask_px))
+    numbers.track_ious.append(box_iou(np.clip(pixels.box, box - 0.5, box + 0.5), pixels.box))
     if track.target.mask_bbox is not None:
         recorded = track.target.mask_bbox[i]
         # A pole may cut the target into parts: its box lies between this part and all pedestrian pixels. NaN fails.
-        if not (_encloses(recorded, mask_px) and _encloses(np.array(people), recorded)):
-            place = f"trajectory.json: points[{i}].target.mask_bbox_2d"
-            report.error("mask_disagrees", place, str(recorded.tolist()), f"the box of the pixels, {mask_px.tolist()}")
+        if not (_encloses(recorded, pixels.box) and _encloses(np.array(figures.person_box), recorded)):
+            where = f"trajectory.json: points[{i}].target.mask_bbox_2d"
+            report.error(
+                "mask_disagrees", where, str(recorded.tolist()), f"the box of the pixels, {pixels.box.tolist()}"
+            )
     expected_m = float(track.target.depth_m[i])
-    found_m = float(np.median(picture.depth[y0:y1, x0:x1][region]))
-    if np.isfinite(expected_m) and abs(found_m - expected_m) > SURFACE_TOLERANCE_M:
+    if np.isfinite(expected_m) and abs(pixels.depth_m - expected_m) > SURFACE_TOLERANCE_M:
         expected = f"{expected_m:.2f} m (target.depth) within {SURFACE_TOLERANCE_M:.1f} m"
-        report.error("depth_disagrees", _depth_place(track, i), f"{found_m:.2f} m at the target", expected)
+        report.error("depth_disagrees", _depth_place(track, i), f"{pixels.depth_m:.2f} m at the target", expected)
+
+
+class _TargetPixels(NamedTuple):
+    """The connected pedestrian pixels at the target's projected box."""
+
+    box: np.ndarray  # (4,) xmin, ymin, xmax, ymax px
+    depth_m: float  # median
+
+
+def _target_pixels(
+    picture: Picture, figures: PixelFigures, is_bystander: np.ndarray, box: np.ndarray
+) -> _TargetPixels | None:
+    """Find the target's pixels within `figures.person_box`; return None if no pedestrian pixel overlaps with `box`."""
+    if figures.person_box is None:
+        return None
+    x0, y0, x1, y1 = figures.person_box
+    instance = picture.instance[y0:y1, x0:x1]
+    ids = instance[..., 1].astype(np.uint16) | (instance[..., 2].astype(np.uint16) << 8)
+    corner = np.array([x0, y0, x0, y0], dtype=np.float64)
+    region = pedestrian_region(np.where(is_bystander[ids], KINDS["NONE"], instance[..., 0]), box - corner)
+    if region is None:
+        return None
+    return _TargetPixels(mask_box(region) + corner, float(np.median(picture.depth[y0:y1, x0:x1][region])))
 
 
 def target_box(track: Track, i: int) -> np.ndarray:
@@ -389,9 +434,9 @@ def pedestrian_region(kinds: np.ndarray, box: np.ndarray) -> np.ndarray | None:
     _, labels = cv2.connectedComponents(is_person, connectivity=8)
     x0, y0 = np.maximum(np.floor(box[:2]), 0).astype(int)
     x1, y1 = np.maximum(np.ceil(box[2:]), 0).astype(int)
-    shared = np.bincount(labels[y0:y1, x0:x1].ravel())
-    shared[:1] = 0  # the background
-    return labels == int(shared.argmax()) if shared.any() else None
+    overlaps_px = np.bincount(labels[y0:y1, x0:x1].ravel())  # by label
+    overlaps_px[:1] = 0  # the background
+    return labels == int(overlaps_px.argmax()) if overlaps_px.any() else None
 
 
 def _encloses(outer: np.ndarray, inner: np.ndarray) -> bool:

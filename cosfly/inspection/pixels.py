@@ -92,45 +92,50 @@ def measure_pixels(picture: Picture, is_bystander: np.ndarray, flat_share: float
     ids = picture.instance[..., 1].astype(np.uint16) | picture.instance[..., 2].astype(np.uint16) << 8
     codes = kinds | ids.astype(np.int32) << 8
     is_surface = (kinds != NOTHING) & (kinds != SKY)
-    flat_id, num_pairs = _flat_surface(picture.colours, codes, is_surface, flat_share)
+    flat_id, num_flat_pairs = _flat_surface(picture.colours, codes, is_surface, flat_share) or (None, 0)
     num_fighting = 0
     if picture.depth.size:
         num_fighting = _num_fighting(codes, picture.depth, picture.colours)
         num_fighting += _num_fighting(codes.T, picture.depth.T, picture.colours.transpose(1, 0, 2))
     return PixelFigures(
-        flat=num_pairs / num_pixels,
-        flat_kind=int(kinds[ids == flat_id][-1]) if num_pairs else 0,
-        magenta=float((magenta & is_surface).sum()) / num_pixels,
+        flat=num_flat_pairs / num_pixels,
+        flat_kind=0 if flat_id is None else int(kinds[ids == flat_id][-1]),  # of a shared id, the lowest pixel decides
+        magenta=float((magenta & is_surface).sum()) / num_pixels,  # not the sky, which may be magenta
         fighting=num_fighting / num_pixels,
         person_box=_box_of((kinds == PERSON) & ~is_bystander[ids]),
     )
 
 
-def _flat_surface(colours: np.ndarray, codes: np.ndarray, is_surface: np.ndarray, flat_share: float) -> tuple[int, int]:
-    """Return the id of the largest surface without texture, and its number of pixel pairs; 0 pairs if there is none.
+def _flat_surface(
+    colours: np.ndarray, codes: np.ndarray, is_surface: np.ndarray, flat_share: float
+) -> tuple[int, int] | None:
+    """Return the id of the largest surface without texture, and its number of pixel pairs; None if there is none.
 
-    A pair is two neighbours of one surface in a row. A renderer whose other surfaces have no grain either draws without
-    textures, so none is missing.
+    A pair is two neighbours of one surface in a row. If the other surfaces have no grain either, the renderer draws
+    without textures, so none is missing.
     """
     red, green, blue = np.moveaxis(colours.astype(np.int32), 2, 0)
     shades = red | green << 8 | blue << 16
     is_pair = is_surface[:, :-1] & (codes[:, :-1] == codes[:, 1:])
     if not is_pair.any():
-        return 0, 0
+        return None
     is_equal = is_pair & (shades[:, :-1] == shades[:, 1:])
-    # Sums over stretches of one id come first: they are few.
-    ids = (codes[:, :-1] >> 8).ravel()
+    ids = codes[:, :-1] >> 8
+    num_pairs, num_equal = _counts_by_id(ids, (is_pair, is_equal))
+    candidates = np.flatnonzero((num_pairs >= LEAST_PAIRS) & (num_equal >= flat_share * num_pairs))
+    for flat_id in sorted(candidates.tolist(), key=lambda k: -num_pairs[k]):
+        if green[:, :-1][is_pair & (ids == flat_id)].mean() >= DARK:
+            num_other_pairs = num_pairs.sum() - num_pairs[flat_id]
+            others_have_grain = num_equal.sum() - num_equal[flat_id] < GRAINLESS * num_other_pairs
+            return (flat_id, int(num_pairs[flat_id])) if others_have_grain else None
+    return None
+
+
+def _counts_by_id(ids: np.ndarray, masks: tuple[np.ndarray, ...]) -> list[np.ndarray]:
+    """Return the number of pixels of each id in each mask, (h, w) bool; it sums the few stretches of one id first."""
+    ids = ids.ravel()
     starts = np.append(0, np.flatnonzero(ids[1:] != ids[:-1]) + 1)
-    pairs, equal = (
-        np.bincount(ids[starts], np.add.reduceat(flags.ravel(), starts, dtype=np.int64))
-        for flags in (is_pair, is_equal)
-    )
-    is_flat = (pairs >= LEAST_PAIRS) & (equal >= flat_share * pairs)
-    for largest in sorted(np.flatnonzero(is_flat).tolist(), key=lambda k: -pairs[k]):
-        if green[:, :-1][is_pair & (codes[:, :-1] >> 8 == largest)].mean() >= DARK:
-            others_have_grain = equal.sum() - equal[largest] < GRAINLESS * (pairs.sum() - pairs[largest])
-            return largest, int(pairs[largest]) if others_have_grain else 0
-    return 0, 0
+    return [np.bincount(ids[starts], np.add.reduceat(mask.ravel(), starts, dtype=np.int64)) for mask in masks]
 
 
 def _num_fighting(codes: np.ndarray, depth: np.ndarray, colours: np.ndarray) -> int:
@@ -145,43 +150,45 @@ def _num_fighting(codes: np.ndarray, depth: np.ndarray, colours: np.ndarray) -> 
     Args:
         codes: (h, w) int32, id << 8 | kind.
     """
-    rows, ends = np.nonzero(codes[:, 1:] != codes[:, :-1])  # the first pixels of all runs but the first of a row
-    starts = ends + 1
-    low, middle, end = starts[:-2], starts[1:-1], starts[2:]
-    is_short = (rows[2:] == rows[:-2]) & (end - middle <= SHORTEST_RUN_PX) & (middle - low <= SHORTEST_RUN_PX)
-    rows, low, middle, end = rows[2:][is_short], low[is_short], middle[is_short], end[is_short]
-    first, second = codes[rows, low - 1], codes[rows, low]
-    alternates = (first == codes[rows, middle]) & (second == codes[rows, end])
+    rows, last_columns = np.nonzero(codes[:, 1:] != codes[:, :-1])
+    starts = last_columns + 1  # the first pixels of all runs but the first of a row
+    is_short = np.diff(starts) <= SHORTEST_RUN_PX
+    runs = np.flatnonzero((rows[2:] == rows[:-2]) & is_short[:-1] & is_short[1:])  # of B, the second of four runs
+    a, b = codes[rows[runs], starts[runs] - 1], codes[rows[runs], starts[runs]]
+    alternates = (a == codes[rows[runs], starts[runs + 1]]) & (b == codes[rows[runs], starts[runs + 2]])
     # Distant fields are narrow stripes without an id.
-    has_ids = (first >> 8 != SHARED_ID) & (second >> 8 != SHARED_ID) & ((first | second) >> 8 != 0)
-    chosen = alternates & has_ids
-    rows, low, middle, end = rows[chosen], low[chosen], middle[chosen], end[chosen]
+    has_ids = (a >> 8 != SHARED_ID) & (b >> 8 != SHARED_ID) & ((a | b) >> 8 != 0)
+    runs = runs[alternates & has_ids]
+    rows, low, middle, end = rows[runs], starts[runs], starts[runs + 1], starts[runs + 2]
     fights = _lie_in_plane(depth, rows, low, end)
-    for k in (middle, end):
-        step = np.abs(colours[rows, k].astype(int) - colours[rows, k - 1]).sum(axis=1)
-        kind_changes = (codes[rows, k] ^ codes[rows, k - 1]) & 255 != 0
+    for edge in (middle, end):
+        step = np.abs(colours[rows, edge].astype(int) - colours[rows, edge - 1]).sum(axis=1)
+        kind_changes = (codes[rows, edge] ^ codes[rows, edge - 1]) & 255 != 0
         fights &= kind_changes | (step > VISIBLE_STEP)
     return int((end - middle)[fights].sum())
 
 
 def _lie_in_plane(depth: np.ndarray, rows: np.ndarray, low: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return whether the pixels from low - 1 to end of a row lie in one plane, (n,) bool."""
-    before_m, last_m = depth[rows, low - 1], depth[rows, end]
-    is_valid = (before_m > INVALID_DEPTH_M) & (before_m < SKY_DEPTH_M)
-    is_valid &= (last_m > INVALID_DEPTH_M) & (last_m < SKY_DEPTH_M)
+    before_m = depth[rows, low - 1]
+    last_m = depth[rows, end]
+    in_plane = (before_m > INVALID_DEPTH_M) & (before_m < SKY_DEPTH_M)
+    in_plane &= (last_m > INVALID_DEPTH_M) & (last_m < SKY_DEPTH_M)
     with np.errstate(divide="ignore", invalid="ignore"):
-        before, last = 1.0 / before_m.astype(float), 1.0 / last_m.astype(float)
+        inverse_before = 1.0 / before_m.astype(float)
+        inverse_last = 1.0 / last_m.astype(float)
         for k in range(2 * SHORTEST_RUN_PX):
-            at = np.minimum(low + k, end)
-            plane = before + (last - before) * (at - low + 1) / (end - low + 1)
-            depth_m = depth[rows, at].astype(float)
-            is_valid &= (depth_m > 0.0) & (np.abs(1.0 / depth_m - plane) <= PLANE_SHARE * plane)
-    return is_valid
+            column = np.minimum(low + k, end)
+            inverse_plane = inverse_before + (inverse_last - inverse_before) * (column - low + 1) / (end - low + 1)
+            depth_m = depth[rows, column].astype(float)
+            in_plane &= (depth_m > 0.0) & (np.abs(1.0 / depth_m - inverse_plane) <= PLANE_SHARE * inverse_plane)
+    return in_plane
 
 
 def _box_of(mask: np.ndarray) -> tuple[int, int, int, int] | None:
     """Return xmin, ymin, xmax, ymax of the pixels of a mask; None without any."""
-    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    columns = np.flatnonzero(mask.any(axis=0))
+    rows = np.flatnonzero(mask.any(axis=1))
     if not len(rows):
         return None
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1

@@ -40,20 +40,24 @@ class ReportPicture(BaseModel):
 
 def pictures_of(track: Track, width_px: int, issues: Sequence[Issue]) -> list[ReportPicture]:
     """Return three pictures of a width, first of the frames of issues, then of the first, middle and last frame."""
-    asked = frames_of_issues(issues, len(track))
-    frames = sorted([*asked, 0, len(track) // 2, len(track) - 1][:3])
+    issue_frames = frames_of_issues(issues, len(track))
+    frames = sorted([*issue_frames, 0, len(track) // 2, len(track) - 1][:3])
     return [
-        ReportPicture(frame=i, jpeg=thumbnail(track.frame_folder(i), width_px), of_issue=i in asked) for i in frames
+        ReportPicture(frame=i, jpeg=thumbnail(track.frame_folder(i), width_px), of_issue=i in issue_frames)
+        for i in frames
     ]
 
 
 def frames_of_issues(issues: Sequence[Issue], num_frames: int) -> list[int]:
     """Return the frames of issues, the worst first. An issue between two frames has both."""
-    frames: dict[int, None] = {}
+    frames: dict[int, None] = {}  # an ordered set
     for issue in sorted(issues, key=sort_key):
-        match = OF_FRAME.search(issue.where) if issue.severity != "note" else None
-        if match is not None and (i := int(match[1])) < num_frames:
-            frames.update(dict.fromkeys([max(i - 1, 0), i] if issue.code in BETWEEN_FRAMES else [i]))
+        match = OF_FRAME.search(issue.where)
+        if match is None or issue.severity == "note" or int(match[1]) >= num_frames:
+            continue
+        if issue.code in BETWEEN_FRAMES:
+            frames[max(int(match[1]) - 1, 0)] = None
+        frames[int(match[1])] = None
     return list(frames)
 
 

@@ -131,6 +131,7 @@ def assemble(
 
 def _unreadable(outcome: Failed, planned: list[DroneTrace], data: Path) -> TrackInspection:
     """Return the record of a track whose inspection failed: rejected, for the reason of the error."""
+    # The id is the track's folder, town/trajectory/variant; a folder less deep in the tree has the last parts only.
     town, trajectory, variant = ("", "", *outcome.id.split("/"))[-3:]
     report = Report()
     report.error("unreadable", outcome.id, outcome.message.replace(f"{data}/", ""), "a track that can be read")

@@ -1,6 +1,7 @@
 """The inspection of one track: its plan, poses, motion and frames, and its record (sec:step6).
 
-The rendered poses are measured against the map, because the poses of a perturbed track differ from the plan.
+Each check adds its issues to `report` and its figures to `metrics`. The rendered poses are measured against the map,
+because the poses of a perturbed track differ from the plan.
 """
 
 from __future__ import annotations
@@ -27,15 +28,8 @@ from cosfly.geometry.trajectory_metrics import (
     length_m,
     smoothness_score,
 )
+from cosfly.inspection import frames as frame_checks
 from cosfly.inspection import settings as limits
-from cosfly.inspection.frames import (
-    check_bystanders,
-    check_files,
-    check_frames,
-    compare_file,
-    listed_digests,
-    target_box,
-)
 from cosfly.inspection.report import ReportPicture, pictures_of
 from cosfly.inspection.settings import InspectConfig
 from cosfly.runtime.errors import InputError
@@ -233,7 +227,7 @@ def check_projection(track: Track, report: Report) -> None:
             continue
         pose = world_from_camera(track.positions_m[i], track.rotations_deg[i])
         uv, depth_m = project(track.targets_m[i : i + 1], pose, track.camera_at(i).intrinsic)
-        box = target_box(track, i)
+        box = frame_checks.target_box(track, i)
         pixels = limits.REPROJECTION_TOLERANCE_PX
         recorded = (
             ("image_uv", target.uv[i], uv[0], pixels, "px"),
@@ -255,41 +249,52 @@ def check_projection(track: Track, report: Report) -> None:
 def _check_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Metrics) -> None:
     """Check files and pixels; the visibility of rendered frames is measured but never rejects (sec:dataset_stats)."""
     assert track.folder is not None
-    metas = check_files(track, report)
-    target = track.target
+    metas = frame_checks.check_files(track, report)
     # Other programs count others in another way.
     bystanders = {i: meta.others for i, meta in metas.items() if track.is_ours and meta and meta.others}
-    check_bystanders(track, bystanders, cfg.clearance_min_m, report, metrics)
-    digests = listed_digests(track.folder, report) if cfg.check_checksums else {}
-    frames = check_frames(track, metas, bystanders, digests, report)
+    frame_checks.check_bystanders(track, bystanders, cfg.clearance_min_m, report, metrics)
+    digests = frame_checks.listed_digests(track.folder, report) if cfg.check_checksums else {}
+    numbers = frame_checks.check_frames(track, metas, bystanders, digests, report)
     for name, digest in digests.items():
-        advance()
-        compare_file(track.folder, name, digest, report)
+        if name not in numbers.read_files:
+            advance()
+            frame_checks.compare_file(track.folder, name, digest, report)
+    _measure_frames(track, numbers, metrics)
+    _judge_frames(track, cfg, report, metrics)
+
+
+def _measure_frames(track: Track, numbers: frame_checks.FrameNumbers, metrics: Metrics) -> None:
+    """Add the figures of the frames that do not depend on the map."""
+    target = track.target
     visibility = target.visibility[~np.isnan(target.visibility)]
-    quality = float(np.mean(frames.track_ious)) if frames.track_ious else None
-    invalid = max(frames.invalid_depth_shares, default=None)
     heights_px = (target.bbox[:, 3] - target.bbox[:, 1])[target.in_view]
     heights_m = track.positions_m[:, 2] - (track.targets_m[:, 2] - TARGET_HEIGHT_M)  # over the target's feet
     is_judged = target.legible is not None and len(heights_px) > 0
-    legible = None if target.legible is None else float(target.legible.mean())
     metrics.update(
-        num_frames_checked=frames.num_checked,
-        num_frames_compared=frames.num_compared,
+        num_frames_checked=numbers.num_checked,
+        num_frames_compared=numbers.num_compared,
         length_m=length_m(track.positions_m),
         height_mean_m=None if np.isnan(heights_m).all() else float(np.nanmean(heights_m)),
         rendered_visibility_mean=float(visibility.mean()) if len(visibility) else None,
         visible_share=float(target.visible.mean()),
-        legible_share=legible,
+        legible_share=None if target.legible is None else float(target.legible.mean()),
         small_share=float((heights_px < LEGIBLE_HEIGHT_PX).mean()) if is_judged else None,
         in_view_share=float(target.in_view.mean()),
         perturbed_share=float(track.perturbation.is_perturbed.mean()),
-        track_quality=quality,
-        invalid_depth_share_max=invalid,
+        track_quality=float(np.mean(numbers.track_ious)) if numbers.track_ious else None,
+        invalid_depth_share_max=max(numbers.invalid_depth_shares, default=None),
     )
+
+
+def _judge_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Metrics) -> None:
+    """Compare the figures of `_measure_frames` with their thresholds."""
+    legible, quality = metrics["legible_share"], metrics["track_quality"]
+    invalid = metrics["invalid_depth_share_max"]
     if legible is not None and legible < cfg.legible_min:
-        where, expected = "trajectory.json: points[].target.legible", f"at least {cfg.legible_min:g} of the frames"
-        report.error("illegible", where, f"true in {legible:.2f} of the frames", expected)
-    if not target.visible.any():
+        where = "trajectory.json: points[].target.legible"
+        got = f"true in {legible:.2f} of the frames"
+        report.error("illegible", where, got, f"at least {cfg.legible_min:g} of the frames")
+    if not track.target.visible.any():
         report.warn("never_visible", "trajectory.json: points[].target.visible", "false everywhere", "a target")
     if quality is not None and quality < limits.TRACK_QUALITY_MIN:
         report.warn("track_quality", "instance.png", f"IoU {quality:.3f}", f"at least {limits.TRACK_QUALITY_MIN}")

@@ -42,6 +42,7 @@ from cosfly.pipeline.runs import summarize
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners import compare
 from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import camera_of
 from cosfly.runtime.config import build, read_yaml
 from cosfly.runtime.errors import InputError, json_type
 from cosfly.runtime.events import LOSSES, Event, read_events
@@ -431,7 +432,7 @@ def derived_figures(cfg: RunConfig, folder: Path, reader: FigureReader, done: Se
     """Return the figures that come from several files, or from none."""
     manifests = {name: read_manifest(folder / name) for name in WITH_ITEMS if name in done}
     lens = RenderConfig(width_px=1280, height_px=720)
-    cameras = {str(fov): zoom.camera_of(lens, fov) for fov in LENSES_DEG}
+    cameras = {str(fov): camera_of(lens, fov) for fov in LENSES_DEG}
     track_lengths = reader.figures("plan/drone_trace.json:traces.*.metrics.num_points")[0]
     figures: dict[str, Any] = {
         "budget": {name: [m.seconds, m.counts.input, m.seconds / m.counts.input] for name, m in manifests.items()},

@@ -18,7 +18,7 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, Field, field_validator
@@ -39,24 +39,40 @@ from cosfly.viz.tables import TextTable, cells
 FORMAT = FileFormat("cosfly.plan_compare", "3.0")
 CLEARANCE_SCALE_M = 5.0  # a clearance of this or more is full safety
 
-FigureColumn = tuple[str, str, int]  # a figure of one trajectory: name, title, digits
+
+class FigureColumn(NamedTuple):
+    """A figure of one trajectory, as a column of tables."""
+
+    name: str
+    title: str
+    digits: int
+
+
+class Criterion(NamedTuple):
+    """A part of the weighted score."""
+
+    figure: str
+    more_is_better: bool
+    weight: float
+
+
 SIGHT_AND_SAFETY = (
-    ("five_ray_mean", "visibility", 3),
-    ("blocked_fraction", "blocked", 3),
-    ("collision_fraction", "collision", 3),
-    ("clearance_min_m", "clearance, m", 2),
+    FigureColumn("five_ray_mean", "visibility", 3),
+    FigureColumn("blocked_fraction", "blocked", 3),
+    FigureColumn("collision_fraction", "collision", 3),
+    FigureColumn("clearance_min_m", "clearance, m", 2),
 )
 FLIGHT = (
-    ("length_m", "length, m", 1),
-    ("duration_s", "time, s", 1),
-    ("target_distance_mean_m", "distance, m", 1),
-    ("altitude_mean_m", "altitude, m", 1),
-    ("accel_rms_mps2", "accel., m/s2", 3),
-    ("jerk_rms_mps3", "jerk, m/s3", 3),
-    ("smoothness_score", "S", 3),
+    FigureColumn("length_m", "length, m", 1),
+    FigureColumn("duration_s", "time, s", 1),
+    FigureColumn("target_distance_mean_m", "distance, m", 1),
+    FigureColumn("altitude_mean_m", "altitude, m", 1),
+    FigureColumn("accel_rms_mps2", "accel., m/s2", 3),
+    FigureColumn("jerk_rms_mps3", "jerk, m/s3", 3),
+    FigureColumn("smoothness_score", "S", 3),
 )
 FIGURES = (*SIGHT_AND_SAFETY, *FLIGHT)
-NAMES = [name for name, _, _ in FIGURES]
+NAMES = [column.name for column in FIGURES]
 NO_TRAJECTORY = {"five_ray_mean": 0.0, "blocked_fraction": 1.0, "collision_fraction": 1.0, "clearance_min_m": 0.0}
 PAPER_DELTAS = {"five_ray_mean", "blocked_fraction", "clearance_min_m", "length_m", "accel_rms_mps2", "jerk_rms_mps3"}
 AXES = ("visibility", "path_efficiency", "smoothness", "safety")
@@ -69,11 +85,10 @@ GROUPS = {
     "gradient, optimization": ("elastic_band", "minimum_jerk", "potential_field", "chomp", "trajopt"),
 }
 GROUP_OF = {planner: group for group, members in GROUPS.items() for planner in members}
-# Criteria of the weighted score: figure, whether more is better, weight (the paper's, see above).
-CRITERIA = {
-    "visibility": ("five_ray_mean", True, 0.35),
-    "collision": ("collision_fraction", False, 0.30),
-    "clearance": ("clearance_min_m", True, 0.35),
+CRITERIA = {  # with the paper's weights, see above
+    "visibility": Criterion("five_ray_mean", True, 0.35),
+    "collision": Criterion("collision_fraction", False, 0.30),
+    "clearance": Criterion("clearance_min_m", True, 0.35),
 }
 
 Means = dict[str, dict[str, float]]  # planner -> mean figures or scores
@@ -140,7 +155,10 @@ def win_rates(pairs: Sequence[tuple[dict[str, float], dict[str, float]]]) -> dic
         "clearance_larger": [a["clearance_min_m"] > b["clearance_min_m"] for a, b in pairs],
         "both_collision_free": [a["collision_fraction"] == b["collision_fraction"] == 0 for a, b in pairs],
     }
-    return {name: {"count": sum(w), "of": len(w), "rate": round(sum(w) / len(w), 4)} for name, w in wins.items()}
+    return {
+        name: {"count": sum(is_won), "of": len(is_won), "rate": round(sum(is_won) / len(is_won), 4)}
+        for name, is_won in wins.items()
+    }
 
 
 def summarize(planned: dict[str, PlannedItem], planners: Sequence[str]) -> dict[str, Any]:
@@ -183,7 +201,7 @@ def ranking(means: Means) -> dict[str, dict[str, Any]]:
         columns.append(share if more_is_better else 1.0 - share)
     normalized = np.stack(columns, axis=1)
     planners = list(means)
-    scores = (normalized @ [weight for *_, weight in CRITERIA.values()]).round(4)
+    scores = (normalized @ [criterion.weight for criterion in CRITERIA.values()]).round(4)
     return {
         planners[k]: {
             "rank": rank,
@@ -299,8 +317,10 @@ def run(
         "notes": {name: NOTES[name] for name in cfg.planners if name in NOTES},
     }
     write_json(product, {**FORMAT.header, **header, **facts, **summarize(planned, cfg.planners)})
-    planned_traces = [item.read_traces(path_id) for path_id, item in planned.items()]
-    traces = {name: [by_planner[name] for by_planner in planned_traces if name in by_planner] for name in cfg.planners}
+    traces: dict[str, list[DroneTrace]] = {name: [] for name in cfg.planners}
+    for path_id, item in planned.items():
+        for name, trace in item.read_traces(path_id).items():
+            traces[name].append(trace)
     trace_paths = {name: out / f"drone_trace_{name}.json" for name in traces}
     for name, path in trace_paths.items():
         write_traces(path, traces[name], {**header, "planner": name})
@@ -333,12 +353,13 @@ def text_tables(product: Path) -> Iterator[TextTable]:
     times = read_manifest(product.parent).facts["timings"]
     first = title_of(next(iter(means)))
 
-    columns, rows = ["found", "free of collisions", *_titles(SIGHT_AND_SAFETY)], {}
+    rows = {}
     for planner, figures in means.items():
         collisions = [scenario[planner]["collision_fraction"] for scenario in scenarios if scenario[planner]]
         counts = [f"{count} of {len(scenarios)}" for count in (len(collisions), collisions.count(0.0))]
         rows[title_of(planner)] = [*counts, *_figure_cells(figures, SIGHT_AND_SAFETY)]
-    yield _table("Sight and safety; a missing trajectory counts as a collision without visibility", columns, rows)
+    title = "Sight and safety; a missing trajectory counts as a collision without visibility"
+    yield _table(title, ["found", "free of collisions", *_titles(SIGHT_AND_SAFETY)], rows)
 
     rows = {
         title_of(planner): [*_figure_cells(figures, FLIGHT), *cells([times[planner]["mean_ms"]], 1)]
@@ -360,23 +381,23 @@ def text_tables(product: Path) -> Iterator[TextTable]:
         ]
         for planner, row in comparison["ranking"].items()
     }  # fmt: skip
-    weights = ", ".join(f"{weight:g} {name}" for name, (*_, weight) in CRITERIA.items())
+    weights = ", ".join(f"{criterion.weight:g} {name}" for name, criterion in CRITERIA.items())
     title = f"Weighted score: {weights}; each is scaled from 0 (worst planner) to 1 (best planner)"
     yield _table(title, ["group", "score", *CRITERIA], rows)
 
-    shown = [*SIGHT_AND_SAFETY, FLIGHT[0]]
+    columns = [*SIGHT_AND_SAFETY, FLIGHT[0]]
     rows = {
-        group: [str(row["num_planners"]), *_figure_cells(row["figures"], shown)]
+        group: [str(row["num_planners"]), *_figure_cells(row["figures"], columns)]
         for group, row in comparison["groups"].items()
     }
-    yield _table("Means of groups of planners", ["planners", *_titles(shown)], rows, head="group")
+    yield _table("Means of groups of planners", ["planners", *_titles(columns)], rows, head="group")
 
-    shown = [column for column in FIGURES if column[0] in PAPER_DELTAS]
+    columns = [column for column in FIGURES if column.name in PAPER_DELTAS]
     rows = {
-        title_of(other): cells((changes[name]["relative_percent"] for name, *_ in shown), 1)
+        title_of(other): cells((changes[column.name]["relative_percent"] for column in columns), 1)
         for other, changes in comparison["deltas"].items()
     }
-    yield _table(f"{first} minus another planner, %", _titles(shown), rows)
+    yield _table(f"{first} minus another planner, %", _titles(columns), rows)
 
     rates = comparison["win_rates"]
     rows = {title_of(other): [f"{w['count']} of {w['of']}" for w in wins.values()] for other, wins in rates.items()}
@@ -389,8 +410,8 @@ def _table(title: str, columns: list[str], rows: dict[str, list[str]], head: str
 
 
 def _titles(figures: Sequence[FigureColumn]) -> list[str]:
-    return [title for _, title, _ in figures]
+    return [column.title for column in figures]
 
 
 def _figure_cells(row: dict[str, float | None], figures: Sequence[FigureColumn]) -> list[str]:
-    return [text for name, _, digits in figures for text in cells([row[name]], digits)]
+    return [text for column in figures for text in cells([row[column.name]], column.digits)]

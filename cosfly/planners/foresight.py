@@ -163,7 +163,7 @@ def search_trajectory(
     num_azimuths = lattice.places_m.shape[2]
     places = lattice.places_m.reshape(len(frames), -1, 3)
     aloft = boxes_aloft(obstacles, scenario.targets_m, lattice)
-    gaps_m, hidden = np.empty(places.shape[:2]), np.empty(places.shape[:2])
+    gaps_m, hidden = np.empty((2, *places.shape[:2]))
     _survey(places, scenario.targets_m[frames], obstacles, aloft.rows, clearance_m, REACH_M, gaps_m, hidden)
     hidden_before, hidden_after = np.roll(hidden, 1, axis=0), np.roll(hidden, -1, axis=0)
     hidden_before[0], hidden_after[-1] = hidden[0], hidden[-1]
@@ -181,12 +181,13 @@ def search_trajectory(
 def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) -> BoxIndex:
     """Index the boxes that may be within REACH_M of a place: most boxes end far below a drone."""
     rows = obstacles.rows
-    flat = targets_m[:, :2]
     aside_m = lattice.radius_max_m + REACH_M
-    keep = rows[:, kernels.HIGH_Z] >= lattice.places_m[:, :, 0, 2].min() - REACH_M
-    keep &= (rows[:, [kernels.HIGH_X, kernels.HIGH_Y]] >= flat.min(axis=0) - aside_m).all(axis=1)
-    keep &= (rows[:, [kernels.LOW_X, kernels.LOW_Y]] <= flat.max(axis=0) + aside_m).all(axis=1)
-    rows = rows[keep]
+    low_xy = targets_m[:, :2].min(axis=0) - aside_m
+    high_xy = targets_m[:, :2].max(axis=0) + aside_m
+    is_aloft = rows[:, kernels.HIGH_Z] >= lattice.places_m[:, :, 0, 2].min() - REACH_M
+    is_aloft &= (rows[:, [kernels.HIGH_X, kernels.HIGH_Y]] >= low_xy).all(axis=1)
+    is_aloft &= (rows[:, [kernels.LOW_X, kernels.LOW_Y]] <= high_xy).all(axis=1)
+    rows = rows[is_aloft]
     return kernels.index_boxes(rows[:, :3], rows[:, 3:6], rows[:, 6:15].reshape(-1, 3, 3), cell_m=2.0 * REACH_M)
 
 
@@ -194,13 +195,17 @@ def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) ->
 def _survey(places, targets, index, aloft_rows, clearance_m, reach_m, gaps_m, hidden):
     """Write the distance of each place to the nearest box, at most `reach_m`, and the hidden share of the target.
 
-    Both are (m, c); places nearer than `clearance_m` to a box count as hidden. aloft_rows: the boxes of `index` within
-    `reach_m` of places.
+    Places nearer than `clearance_m` to a box count as hidden.
+
+    Args:
+        aloft_rows: the boxes of `index` within `reach_m` of places.
+        gaps_m, hidden: (m, c), written.
     """
     near_rows = np.empty(len(aloft_rows), dtype=np.int64)
     for key in range(len(places)):
         target = targets[key]
-        farthest_m, least_slope = 0.0, np.inf
+        farthest_m = 0.0
+        least_slope = np.inf
         for c in range(places.shape[1]):
             away_m = np.sqrt((places[key, c, 0] - target[0]) ** 2 + (places[key, c, 1] - target[1]) ** 2)
             farthest_m = max(farthest_m, away_m)
@@ -228,9 +233,11 @@ def _survey(places, targets, index, aloft_rows, clearance_m, reach_m, gaps_m, hi
 def _cheapest(places, place_costs, gaps_m, longest_m, aloft, clearance_m, links, num_azimuths, max_turn, way_cost):
     """Return the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
 
-    places: (m, c, 3), c = rings * azimuths. place_costs: (m, c). gaps_m: (m, c). longest_m: (m,) longest move into each
-    key frame. aloft: index of the boxes within REACH_M of places. links: (rings, r) previous rings, the first -1 ends
-    the list.
+    Args:
+        places: (m, c, 3), c = rings * azimuths. place_costs, gaps_m: (m, c) of each place.
+        longest_m: (m,) longest move into each key frame.
+        aloft: index of the boxes within REACH_M of places.
+        links: (rings, r) previous rings of each ring; the first -1 ends the list.
     """
     num_keys, num_places = len(places), places.shape[1]
     first_hit = np.empty(1, dtype=np.int64)

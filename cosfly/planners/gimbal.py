@@ -72,16 +72,17 @@ def follow_direction(
     stiffness = (2.0 * np.pi * gimbal.bandwidth_hz) ** 2
     friction = 4.0 * np.pi * gimbal.bandwidth_hz * gimbal.damping
     rate_max = np.radians(rate_max_degps)
-    followed = []
-    for goal, error in zip((pitch, np.unwrap(yaw)), errors.T, strict=True):
-        goals = np.interp(times_s - gimbal.delay_s, frames_s, goal) + np.interp(times_s, frames_s, error)
-        angle, rate = float(goals[0]), 0.0
+    axes_deg = []
+    for target, error in zip((pitch, np.unwrap(yaw)), errors.T, strict=True):
+        aims = np.interp(times_s - gimbal.delay_s, frames_s, target) + np.interp(times_s, frames_s, error)
+        angle = float(aims[0])
+        rate = 0.0
         angles = [angle]
-        for value in goals[1:].tolist():
-            rate += (stiffness * (value - angle) - friction * rate) * part_s
+        for aim in aims[1:].tolist():
+            rate += (stiffness * (aim - angle) - friction * rate) * part_s
             rate = min(max(rate, -rate_max), rate_max)
             angle += rate * part_s
             angles.append(angle)
-        followed.append(np.degrees(angles[::num_parts]))
-    pitch_deg, yaw_deg = followed
+        axes_deg.append(np.degrees(angles[::num_parts]))
+    pitch_deg, yaw_deg = axes_deg
     return np.radians(np.clip(pitch_deg, LOWEST_PITCH_DEG, HIGHEST_PITCH_DEG)), np.radians(wrap_deg(yaw_deg))

@@ -65,7 +65,8 @@ def make_horizon(index, target, reach_m, least_slope):
 def five_ray_visibility(index, horizon, target, x, y, z):
     """Return the share of free rays to the target of a horizon from a point above it, as `kernels.visibility` does."""
     dx, dy = x - target[0], y - target[1]
-    away_m, rise_m = np.sqrt(dx * dx + dy * dy), z - target[2] - LOWEST_END_M
+    away_m = np.sqrt(dx * dx + dy * dy)
+    rise_m = z - target[2] - LOWEST_END_M
     sector = int(np.floor(np.arctan2(dy, dx) / (2.0 * np.pi) * NUM_SECTORS)) % NUM_SECTORS
     # A slope times a distance instead of a quotient, because a point straight above has the distance 0.
     if horizon.counts[sector] == 0 or rise_m > horizon.steepest[sector] * away_m + ROUNDING_M:
@@ -114,7 +115,8 @@ def _boxes_in_reach(index, target, reach_m, least_slope):
                 away_m = np.sqrt(dx * dx + dy * dy)
                 if away_m > reach_m + SIDE_END_M or row[HIGH_Z] < low_m:
                     continue
-                boxes[num], nearest_m[num] = box, max(away_m - SIDE_END_M, 0.0)
+                boxes[num] = box
+                nearest_m[num] = max(away_m - SIDE_END_M, 0.0)
                 slopes[num] = (row[HIGH_Z] - low_m) / nearest_m[num] if nearest_m[num] > NO_DISTANCE_M else np.inf
                 if slopes[num] < least_slope - SLOPE_ROUNDING:
                     continue
@@ -154,6 +156,7 @@ def _blocked_rays(rows, box, x, y, z, target, blocked):
     # loop, because the compiler takes seconds for each call of `touches` that is written out.
     thinnest_m = min(rows[box, HALF_X], rows[box, HALF_Y], rows[box, HALF_Z])
     for step in range(2 + NUM_RAYS):
+        ray = step - 2  # negative for the ray to the hip
         grown_m, end_u, end_v, end_w = 0.0, 0.0, 0.0, 0.0
         if step == 0:
             grown_m = kernels.RAY_SPREAD_M
@@ -161,10 +164,9 @@ def _blocked_rays(rows, box, x, y, z, target, blocked):
             if thinnest_m < kernels.RAY_SPREAD_M:
                 continue
             grown_m = -kernels.RAY_SPREAD_M
-        elif (blocked >> (step - 2)) & 1:
+        elif (blocked >> ray) & 1:
             continue
         else:
-            ray = step - 2
             end_u, end_v, end_w = kernels.turned(rows, box, ends_m[ray, 0], ends_m[ray, 1], ends_m[ray, 2])
         hits = touches(rows, box, hip_u + end_u, hip_v + end_v, hip_w + end_w, u, v, w, grown_m)
         if step == 0 and not hits:
@@ -172,5 +174,5 @@ def _blocked_rays(rows, box, x, y, z, target, blocked):
         if step == 1 and hits:
             return int64(ALL_BLOCKED)
         if step > 1 and hits:
-            blocked |= 1 << (step - 2)
+            blocked |= 1 << ray
     return blocked

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -48,54 +48,75 @@ class ManeuverPlan:
         return any(part.style == REACQUIRE for part in self.segments)
 
 
+class _Stretch(NamedTuple):
+    """A part of a pedestrian trajectory that becomes a segment with one style."""
+
+    pedestrian_index: int
+    pedestrian: PedestrianTrajectory
+    points: np.ndarray  # (k,) indices
+
+
 def draw_styles(
     pedestrians: Sequence[PedestrianTrajectory], cfg: PlanConfig, rng: np.random.Generator
 ) -> list[list[str]]:
     """Draw the styles of the segments of each trajectory of a run, so that their numbers follow the shares exactly.
 
-    Styles of whole trajectories are drawn first. Some of the other styles suit a pedestrian with uneven speed or a
-    straight path: they get the segments with the greatest measure of that (MEASURES), up to their share of the time, so
-    that the drone has a reason to change its pace.
+    Styles of whole trajectories are drawn first; each is the only or the last style of its trajectory.
     """
     shares = {style: share for style, share in cfg.styles.items() if style not in WHOLE}
-    shares_sum = sum(shares.values())
-    shares = shares if shares_sum else {FOLLOW: 1.0}  # `follow` precedes `return_home`
-    for style, mirror_style in zip([*shares], mirrored([*shares]), strict=True):
-        if style != mirror_style:
-            shares[style] = shares[mirror_style] = shares[style] / 2.0
     whole_shares = {style: share for style, share in cfg.styles.items() if style in WHOLE}
     whole_rng, segments_rng = rng.spawn(2)
-    last_styles = [*islice(draw_to_quota(whole_shares | {"": shares_sum}, whole_rng), len(pedestrians))]
-    segments = list[tuple[int, np.ndarray]]()  # index of the pedestrian trajectory, and its points in the segment
+    last_styles = [*islice(draw_to_quota(whole_shares | {"": sum(shares.values())}, whole_rng), len(pedestrians))]
+    stretches = list[_Stretch]()
     for index, (pedestrian, last_style) in enumerate(zip(pedestrians, last_styles, strict=True)):
         if last_style == REACQUIRE:
             continue
         num_points = len(pedestrian.time_s)
         num = round(float(pedestrian.time_s[-1]) / cfg.segment_s) if cfg.segment_s else 1
         num = max(1, min(num, num_points // POINTS_LEAST))
-        segments += [(index, points) for points in np.array_split(np.arange(num_points), num)]
-    unassigned = [*range(len(segments))]
-    unassigned_share = sum(shares.values())
-    styles_of = dict[int, str]()
-    for kind, measure in MEASURES.items():
-        kind_shares = {style: share for style, share in shares.items() if suits(style) == kind}
-        share = sum(kind_shares.values())
-        if not (unassigned and share):
-            continue
-        unassigned.sort(key=lambda k: (-measure(pedestrians[segments[k][0]], segments[k][1]), k))
-        lengths = np.array([len(segments[k][1]) for k in unassigned])
-        ends = np.cumsum(lengths) - segments_rng.random() * lengths
-        num = int((ends <= lengths.sum() * share / unassigned_share).sum())
-        unassigned_share -= share
-        styles_of |= zip(sorted(unassigned[:num]), draw_to_quota(kind_shares, segments_rng), strict=False)
-        unassigned = unassigned[num:]
+        stretches += [_Stretch(index, pedestrian, points) for points in np.array_split(np.arange(num_points), num)]
     drawn = [list[str]() for _ in pedestrians]
-    for k, (index, _) in enumerate(segments):
-        drawn[index].append(styles_of[k])
+    if not sum(shares.values()):
+        shares = {FOLLOW: 1.0}  # `follow` precedes `return_home`
+    for stretch, style in zip(stretches, _draw_segment_styles(stretches, shares, segments_rng), strict=True):
+        drawn[stretch.pedestrian_index].append(style)
     return [names + ([last] if last else []) for names, last in zip(drawn, last_styles, strict=True)]
 
 
+def _draw_segment_styles(
+    stretches: Sequence[_Stretch], shares: dict[str, float], rng: np.random.Generator
+) -> list[str]:
+    """Draw a style for each stretch, mirrored for half of those with two sides.
+
+    Some styles suit a pedestrian with uneven speed or a straight path: they get the stretches with the greatest measure
+    of that (MEASURES), up to their share of the time, so that the drone has a reason to change its pace.
+    """
+    shares = dict(shares)
+    for style, mirror_style in zip([*shares], mirrored([*shares]), strict=True):
+        if style != mirror_style:
+            shares[mirror_style] = shares[style] / 2.0
+            shares[style] = shares[mirror_style]
+    unassigned = [*range(len(stretches))]
+    unassigned_share = sum(shares.values())
+    style_of = dict[int, str]()
+    for motion, measure in MEASURES.items():
+        suited_shares = {style: share for style, share in shares.items() if suits(style) == motion}
+        share = sum(suited_shares.values())
+        if not (unassigned and share):
+            continue
+        unassigned.sort(key=lambda k: (-measure(stretches[k].pedestrian, stretches[k].points), k))
+        # The last stretch is rounded at random: it counts if a random point of it is within the share of the time.
+        lengths = np.array([len(stretches[k].points) for k in unassigned])
+        ends = np.cumsum(lengths) - rng.random() * lengths
+        num = int((ends <= lengths.sum() * share / unassigned_share).sum())
+        unassigned_share -= share
+        style_of |= zip(sorted(unassigned[:num]), draw_to_quota(suited_shares, rng), strict=False)
+        unassigned = unassigned[num:]
+    return [style_of[k] for k in range(len(stretches))]
+
+
 def _straightness(pedestrian: PedestrianTrajectory, points: np.ndarray) -> float:
+    """Return the distance from the first to the last point over the length of the path between them."""
     steps_m = np.diff(pedestrian.positions_m[points, :2], axis=0)
     return float(np.hypot(*steps_m.sum(axis=0)) / max(float(np.hypot(*steps_m.T).sum()), 1e-9))
 
@@ -157,10 +178,11 @@ def _is_held(reference: TrackingReference, scenario: Scenario, positions_m: np.n
     """Return at which frames a trajectory is near its reference position, (n,) bool."""
     requested = reference.places_m(scenario.targets_m, scenario.ground_m) - scenario.targets_m
     planned = positions_m - scenario.targets_m
-    requested_m, planned_m = np.linalg.norm(requested, axis=1), np.linalg.norm(planned, axis=1)
-    cosine = (requested * planned).sum(axis=1) / np.maximum(requested_m * planned_m, 1e-9)
-    requested_plane_m, planned_plane_m = np.hypot(*requested[:, :2].T), np.hypot(*planned[:, :2].T)
-    is_near = np.abs(planned_plane_m - requested_plane_m) <= np.maximum(HELD_M, HELD_SHARE_M * requested_plane_m)
+    lengths_m2 = np.linalg.norm(requested, axis=1) * np.linalg.norm(planned, axis=1)
+    cosine = (requested * planned).sum(axis=1) / np.maximum(lengths_m2, 1e-9)
+    requested_m = np.hypot(*requested[:, :2].T)  # in the plane
+    planned_m = np.hypot(*planned[:, :2].T)
+    is_near = np.abs(planned_m - requested_m) <= np.maximum(HELD_M, HELD_SHARE_M * requested_m)
     return (cosine >= np.cos(np.radians(HELD_DEG))) & is_near
 
 
@@ -204,23 +226,26 @@ def end_with_order(
     assert maneuvers.order is not None
     num = len(positions_m)
     dt_s = scenario.dt_s
-    order_frame = num - 1
     first_frame = max(1, int(num * PURSUIT_LEAST))
     last_arrival = num - round(HOLDS_S / dt_s)
-    legs = _legs_home(positions_m, scenario.targets_m[-1], obstacles, cfg, dt_s)
-    while order_frame > first_frame and order_frame + sum(map(len, legs)) > last_arrival:
-        order_frame = max(first_frame, min(order_frame - 1, last_arrival - sum(map(len, legs))))
-        legs = _legs_home(positions_m[: order_frame + 1], scenario.targets_m[order_frame], obstacles, cfg, dt_s)
-    if order_frame + sum(map(len, legs)) > last_arrival:
+    order_frame = num - 1
+    while True:  # earlier and earlier, until the drone arrives in time
+        trail_m = positions_m[: order_frame + 1]
+        leg_away, leg_home = _legs_home(trail_m, scenario.targets_m[order_frame], obstacles, cfg, dt_s)
+        num_home = len(leg_away) + len(leg_home)
+        if order_frame <= first_frame or order_frame + num_home <= last_arrival:
+            break
+        order_frame = max(first_frame, min(order_frame - 1, last_arrival - num_home))
+    if order_frame + num_home > last_arrival:
         whole = Segment(RETURN_HOME, 0, num, keeps_sight=False)
         return replace(maneuvers, impossible="no_time_for_home", segments=(whole,)), positions_m
-    flown = np.vstack([positions_m[: order_frame + 1], *legs])
+    flown = np.vstack([trail_m, leg_away, leg_home])
     positions = np.vstack([flown, np.tile(flown[-1], (num - len(flown), 1))])
     # Smooth the way home; the pursuit stays as it is.
     share = np.clip((np.arange(num) - order_frame) * dt_s / (2.0 * ROUNDING_S), 0.0, 1.0)[:, None]
     positions += share * (gaussian_filter1d(positions, ROUNDING_S / dt_s, axis=0, mode="nearest") - positions)
     home_m = np.round(positions_m[0], 4)
-    mission = Mission(maneuvers.order, order_frame, order_frame + len(legs[0]), tuple(home_m.tolist()))
+    mission = Mission(maneuvers.order, order_frame, order_frame + len(leg_away), tuple(home_m.tolist()))
     pursuit = tuple(
         Segment(segment.style, segment.begin, min(segment.end, order_frame))
         for segment in maneuvers.segments
@@ -235,9 +260,11 @@ def end_with_order(
 
 def _legs_home(
     trail_m: np.ndarray, target_m: np.ndarray, obstacles: BoxIndex, cfg: PlanConfig, dt_s: float
-) -> list[np.ndarray]:
-    """Return the leg from the end of a trail (k, 3) away from the target, and the leg home along the trail, with
-    shortcuts where they are free."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the leg from the end of a trail (k, 3) away from the target, and the leg home.
+
+    The leg home goes back along the trail, with shortcuts where they are free.
+    """
     from cosfly.geometry.kernels import segments_hit
 
     def are_free(start: np.ndarray, ends: np.ndarray) -> np.ndarray:
@@ -248,7 +275,7 @@ def _legs_home(
     outwards = LEAVES_M * away / max(float(np.linalg.norm(away)), 1e-6)
     up = np.array([0.0, 0.0, CLIMBS_M])
     candidates = here + np.stack([outwards + up, outwards, up, 0.0 * up])  # the last is the drone's own position
-    aside = candidates[int(np.argmax([*are_free(here, candidates[:3]), True]))]
+    aside = candidates[int(np.argmax([*are_free(here, candidates[:3]), True]))]  # the first free one
     corners = [aside]
     trail_index = len(trail_m)
     while trail_index > 0:
@@ -256,20 +283,19 @@ def _legs_home(
         trail_index = int(np.argmax(free)) if free.any() else trail_index - 1
         corners.append(trail_m[trail_index])
     leg_away = _positions_along(np.stack([here, aside]), LEAVES_MPS, dt_s)
-    leg_home = _positions_along(np.stack(corners), HOME_MPS, dt_s)
-    return [leg_away, leg_home]
+    return leg_away, _positions_along(np.stack(corners), HOME_MPS, dt_s)
 
 
 def _positions_along(corners_m: np.ndarray, most_mps: float, dt_s: float) -> np.ndarray:
     """Return positions (k, 3), dt_s apart, along a polyline from rest to rest, without its first point."""
     along_m = distances_along_m(corners_m)
     speed_mps = min(most_mps, np.sqrt(HOME_MPS2 * along_m[-1]))
-    seconds = along_m[-1] / max(speed_mps, 1e-9) + speed_mps / HOME_MPS2
-    times = dt_s * np.arange(1, max(1, int(np.ceil(seconds / dt_s))) + 1)
-    ramp_s = speed_mps / HOME_MPS2
-    since_start_s = np.minimum(times, ramp_s)
-    until_end_s = np.clip(seconds - times, 0.0, ramp_s)
-    gone_m = speed_mps * np.minimum(times, seconds) - 0.5 * speed_mps**2 / HOME_MPS2
+    ramp_s = speed_mps / HOME_MPS2  # of speeding up, and of slowing down
+    duration_s = along_m[-1] / max(speed_mps, 1e-9) + ramp_s
+    times_s = dt_s * np.arange(1, max(1, int(np.ceil(duration_s / dt_s))) + 1)
+    since_start_s = np.minimum(times_s, ramp_s)
+    until_end_s = np.clip(duration_s - times_s, 0.0, ramp_s)
+    gone_m = speed_mps * np.minimum(times_s, duration_s) - 0.5 * speed_mps**2 / HOME_MPS2
     gone_m += 0.5 * HOME_MPS2 * ((ramp_s - since_start_s) ** 2 - (ramp_s - until_end_s) ** 2)
     return np.stack([np.interp(gone_m, along_m, corners_m[:, axis]) for axis in range(3)], axis=1)
 
@@ -317,8 +343,8 @@ def _turned_home(
     pitch, yaw = look_at(positions_m, targets_m)
     for i in range(order_frame + 1, len(yaw)):
         moves = np.hypot(*velocity[i]) >= STANDING_MPS
-        course = np.arctan2(velocity[i, 1], velocity[i, 0]) if moves else yaw[i - 1]
-        yaw[i] = yaw[i - 1] + np.clip(_wrapped(course - yaw[i - 1]), -step, step)
+        direction = np.arctan2(velocity[i, 1], velocity[i, 0]) if moves else yaw[i - 1]
+        yaw[i] = yaw[i - 1] + np.clip(_wrapped(direction - yaw[i - 1]), -step, step)
         pitch[i] = pitch[i - 1] + np.clip(np.radians(HOME_PITCH_DEG) - pitch[i - 1], -step, step)
     return pitch, _wrapped(yaw)
 
@@ -342,4 +368,5 @@ def _searching(
 
 
 def _wrapped(angles: np.ndarray) -> np.ndarray:
+    """Return angles from -pi to pi."""
     return np.arctan2(np.sin(angles), np.cos(angles))

@@ -28,22 +28,8 @@ from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 from scipy.optimize import minimize
 
-from cosfly.geometry.kernels import (
-    HALF_X,
-    HALF_Y,
-    HIGH_X,
-    HIGH_Y,
-    HIGH_Z,
-    LOW_X,
-    LOW_Y,
-    XU,
-    YW,
-    BoxIndex,
-    collect_hits,
-    normals,
-    segments_hit,
-    signed_distances,
-)
+from cosfly.geometry import kernels
+from cosfly.geometry.kernels import BoxIndex, collect_hits, normals, segments_hit, signed_distances
 from cosfly.geometry.trajectory_metrics import distances_along_m
 from cosfly.planners.contract import Plan, PlanConfig, Planner, Scenario
 from cosfly.planners.smoothing import PULL_FIXED, repair_to_limits, smoothness_band
@@ -90,9 +76,9 @@ class Task:
 
     def along(self, route: np.ndarray) -> np.ndarray:
         """Return the trajectory of even speed along a route (m, 3), (num, 3)."""
-        along_m = distances_along_m(route)
-        wanted_m = np.linspace(0.0, along_m[-1], self.num)
-        return np.stack([np.interp(wanted_m, along_m, route[:, axis]) for axis in range(3)], axis=1)
+        route_m = distances_along_m(route)
+        points_m = np.linspace(0.0, route_m[-1], self.num)
+        return np.stack([np.interp(points_m, route_m, route[:, axis]) for axis in range(3)], axis=1)
 
 
 def make_task(
@@ -181,7 +167,8 @@ def _search(places, shape, start, voxel_m, index, clearance_m, weight, any_angle
     cost = np.full(goal + 1, np.inf)
     done = np.zeros(goal + 1, dtype=np.bool_)
     parent = np.full(goal + 1, -1, dtype=np.int64)
-    cost[start], parent[start] = 0.0, start
+    cost[start] = 0.0
+    parent[start] = start
     queue = [(0.0, start)]
     while len(queue) > 0 and not done[goal]:
         _, cell = heapq.heappop(queue)
@@ -201,23 +188,22 @@ def _search(places, shape, start, voxel_m, index, clearance_m, weight, any_angle
             if done[there]:
                 continue
             via = cell
-            if (
-                any_angle
-                and parent[cell] != cell
-                and _are_joined(places, parent[cell], there, index, clearance_m, first_hit)
-            ):
+            has_shortcut = any_angle and parent[cell] != cell
+            if has_shortcut and _are_joined(places, parent[cell], there, index, clearance_m, first_hit):
                 via = parent[cell]
-            longer = cost[via] + _apart(places, via, there)
-            if longer < cost[there] and (via != cell or _are_joined(places, via, there, index, clearance_m, first_hit)):
-                cost[there], parent[there] = longer, via
-                heapq.heappush(queue, (longer + weight * _apart(places, there, goal), there))
-    way = np.empty(0, dtype=np.int64)
-    if done[goal]:
-        cells = [goal]
-        while cells[-1] != start:
-            cells.append(parent[cells[-1]])
-        way = np.array(cells)[::-1]
-    return way
+            new_cost = cost[via] + _apart(places, via, there)
+            if new_cost >= cost[there]:
+                continue
+            if via != cell or _are_joined(places, via, there, index, clearance_m, first_hit):
+                cost[there] = new_cost
+                parent[there] = via
+                heapq.heappush(queue, (new_cost + weight * _apart(places, there, goal), there))
+    if not done[goal]:
+        return np.empty(0, dtype=np.int64)
+    cells = [goal]
+    while cells[-1] != start:
+        cells.append(parent[cells[-1]])
+    return np.array(cells)[::-1]
 
 
 @njit(cache=True, inline="always")
@@ -234,29 +220,32 @@ def _apart(places, a, b):
 
 def _over_corners(task: Task) -> np.ndarray | None:
     """Search the corners; return the trajectory, (num, 3), None if there is no path."""
+    start, goal = 0, 1
     places = np.vstack([task.start, task.goal, _corners(task)])
     to_goal_m = np.linalg.norm(places - task.goal, axis=1)
-    cost = np.full(len(places), np.inf)
+    cost_m = np.full(len(places), np.inf)
     parent = np.full(len(places), -1)
     done = np.zeros(len(places), dtype=bool)
-    cost[0] = 0.0
-    queue = [(to_goal_m[0], 0)]
-    while queue and not done[1]:
+    cost_m[start] = 0.0
+    queue = [(to_goal_m[start], start)]
+    while queue and not done[goal]:
         here = heapq.heappop(queue)[1]
         if done[here]:
             continue
         done[here] = True
-        longer_m = cost[here] + np.linalg.norm(places - places[here], axis=1)
+        new_cost_m = cost_m[here] + np.linalg.norm(places - places[here], axis=1)
         # Places that cannot be on a shorter path to the goal than the known one are ignored.
-        open_ = np.flatnonzero(~done & (longer_m < cost) & (longer_m + to_goal_m < cost[1] + 1e-9))
-        open_ = open_[~task.hits(np.broadcast_to(places[here], (len(open_), 3)), places[open_])]
-        cost[open_], parent[open_] = longer_m[open_], here
-        for there in open_.tolist():
-            heapq.heappush(queue, (cost[there] + to_goal_m[there], there))
-    if not np.isfinite(cost[1]):
+        may_help = ~done & (new_cost_m < cost_m) & (new_cost_m + to_goal_m < cost_m[goal] + 1e-9)
+        nexts = np.flatnonzero(may_help)
+        nexts = nexts[~task.hits(np.broadcast_to(places[here], (len(nexts), 3)), places[nexts])]
+        cost_m[nexts] = new_cost_m[nexts]
+        parent[nexts] = here
+        for there in nexts.tolist():
+            heapq.heappush(queue, (cost_m[there] + to_goal_m[there], there))
+    if not np.isfinite(cost_m[goal]):
         return None
-    way = [1]
-    while way[-1] != 0:
+    way = [goal]
+    while way[-1] != start:
         way.append(int(parent[way[-1]]))
     return task.along(places[way[::-1]])
 
@@ -265,16 +254,16 @@ def _corners(task: Task) -> np.ndarray:
     """Return the free corners of boxes in the volume, (m, 3), those nearest to the straight line first."""
     rows = task.obstacles.rows
     beyond_m = task.clearance_m + BEYOND_M
-    keep = rows[:, HIGH_Z] + task.clearance_m > task.low[2]
-    keep &= (rows[:, [HIGH_X, HIGH_Y]] >= task.low[:2]).all(axis=1)
-    keep &= (rows[:, [LOW_X, LOW_Y]] <= task.high[:2]).all(axis=1)
-    rows = rows[keep]
-    turns = rows[:, XU:YW].reshape(-1, 5)[:, [0, 1, 3, 4]].reshape(-1, 2, 2)
-    out = SIDES * (rows[:, None, [HALF_X, HALF_Y]] + beyond_m)
-    xy = rows[:, None, :2] + np.einsum("kij,ksj->ksi", turns, out)
-    same = np.ones(len(rows))
-    heights = (task.start[2] * same, task.goal[2] * same, rows[:, HIGH_Z] + beyond_m)
-    layers = [np.dstack([xy, np.broadcast_to(z[:, None], xy.shape[:2])]) for z in heights]
+    is_in_volume = rows[:, kernels.HIGH_Z] + task.clearance_m > task.low[2]
+    is_in_volume &= (rows[:, [kernels.HIGH_X, kernels.HIGH_Y]] >= task.low[:2]).all(axis=1)
+    is_in_volume &= (rows[:, [kernels.LOW_X, kernels.LOW_Y]] <= task.high[:2]).all(axis=1)
+    rows = rows[is_in_volume]
+    turns = rows[:, kernels.XU : kernels.YW].reshape(-1, 5)[:, [0, 1, 3, 4]].reshape(-1, 2, 2)  # x and y of the frame
+    offsets = SIDES * (rows[:, None, [kernels.HALF_X, kernels.HALF_Y]] + beyond_m)
+    xy = rows[:, None, :2] + np.einsum("kij,ksj->ksi", turns, offsets)
+    # Each corner at the heights of the start, of the goal, and above its box.
+    heights = (task.start[2:], task.goal[2:], rows[:, kernels.HIGH_Z, None] + beyond_m)
+    layers = [np.dstack([xy, np.broadcast_to(z, xy.shape[:2])]) for z in heights]
     places = np.concatenate([layer.reshape(-1, 3) for layer in layers])
     places = np.unique(places[((places >= task.low) & (places <= task.high)).all(axis=1)], axis=0)
     places = places[~task.hits(places, places)]
@@ -371,7 +360,7 @@ def chomp(task: Task) -> np.ndarray:
 ITERATIONS = 80  # for each weight of the hinge
 HINGE_WEIGHTS = (1.0, 10.0, 100.0)
 HINGE_BEYOND_M = 0.5  # the hinge begins this far beyond the clearance
-DIFFERENCES = ((1.0, 1), (5.0, 2))  # weight and order of squared differences
+DIFFERENCES = ((1.0, (-1.0, 1.0)), (5.0, (1.0, -2.0, 1.0)))  # weights and coefficients of squared differences
 
 
 def trajopt(task: Task) -> np.ndarray:
@@ -392,10 +381,10 @@ def _loss(inner: np.ndarray, task: Task, weight: float) -> tuple[float, np.ndarr
     points = np.vstack([task.start, inner.reshape(-1, 3), task.goal])
     loss = 0.0
     slopes = np.zeros_like(points)
-    for share, order in DIFFERENCES:
-        changes = np.diff(points, n=order, axis=0)
+    for share, coefficients in DIFFERENCES:
+        changes = np.diff(points, n=len(coefficients) - 1, axis=0)
         loss += share * float((changes**2).sum())
-        for k, coefficient in enumerate(((-1.0, 1.0), (1.0, -2.0, 1.0))[order - 1]):
+        for k, coefficient in enumerate(coefficients):
             slopes[k : k + len(changes)] += 2.0 * share * coefficient * changes
     gaps_m, away = task.near(points, task.clearance_m + HINGE_BEYOND_M)
     intrusions_m = task.clearance_m + HINGE_BEYOND_M - gaps_m

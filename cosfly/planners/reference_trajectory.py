@@ -142,27 +142,27 @@ def _course(
     heading_rad = scenario.reference.heading_rad[part]
     dt_s = scenario.dt_s
     seconds = np.arange(len(targets_m)) * dt_s
-    apart_m = _even(style.ground_distance_m, style.ground_distance_end_m, EVEN_APART_MPS, seconds, rng)
+    distance_m = _even(style.ground_distance_m, style.ground_distance_end_m, EVEN_APART_MPS, seconds, rng)
     altitude_m = _even(style.altitude_m, style.altitude_end_m, EVEN_CLIMB_MPS, seconds, rng)
     if style.bearing_deg is None:
         bearing = rng.uniform(-np.pi, np.pi) if azimuth_before is None else azimuth_before - heading_rad[0]
     else:
         bearing = np.radians(rng.uniform(*style.bearing_deg))
     if style.hop_s is None:
-        azimuth = _steady(heading_rad) + bearing + rng.uniform(*style.round_mps) * seconds / apart_m
-        return np.column_stack([azimuth, apart_m, altitude_m])
-    # In each halt the distance is the drawn one at one moment: at the end if the target approaches, at the start if it
-    # leaves.
+        azimuth = _steady(heading_rad) + bearing + rng.uniform(*style.round_mps) * seconds / distance_m
+        return np.column_stack([azimuth, distance_m, altitude_m])
+    # The drone hovers from halt to halt. At each, the distance is the drawn one at one moment: at the end if the target
+    # approaches, at the start if it leaves.
     share = 0.5 * (1.0 + np.cos(bearing))
-    places = np.empty((len(targets_m), 2))
+    halts_m = np.empty((len(targets_m), 2))
     begin = 0
     while begin < len(targets_m):
         end = min(begin + max(2, round(rng.uniform(*style.hop_s) / dt_s)), len(targets_m))
         moment = begin + round(share * (end - 1 - begin))
         azimuth = heading_rad[moment] + bearing
-        places[begin:end] = targets_m[moment, :2] + apart_m[moment] * np.array([np.cos(azimuth), np.sin(azimuth)])
+        halts_m[begin:end] = targets_m[moment, :2] + distance_m[moment] * np.array([np.cos(azimuth), np.sin(azimuth)])
         begin = end
-    away = places - targets_m[:, :2]
+    away = halts_m - targets_m[:, :2]
     return np.column_stack([np.arctan2(away[:, 1], away[:, 0]), np.hypot(away[:, 0], away[:, 1]), altitude_m])
 
 
@@ -207,15 +207,15 @@ def reacquire_reference(
     style = cfg.style(REACQUIRE)
     for _ in range(HIDING_TRIES):
         course = _watching(style, scenario, rng)
-        searches_m = style.ground_distance_end_m or style.ground_distance_m
-        climb_m, near_m = rng.uniform(*style.climb_m), rng.uniform(*searches_m)
+        climb_m = rng.uniform(*style.climb_m)
+        search_distance_m = rng.uniform(*(style.ground_distance_end_m or style.ground_distance_m))
         seen = visibility(screens, positions_of(course, targets, ground), targets)
         lost = first_loss(seen, dt_s, DEEP_LOSS_S)
         if lost is None:
             continue
         searching = np.arange(len(course)) >= lost + round(WAITS_S / dt_s)
         course[searching, 0] = scenario.reference.heading_rad[searching] + np.pi
-        course[searching, 1:] = near_m, course[lost, 2] + climb_m
+        course[searching, 1:] = search_distance_m, course[lost, 2] + climb_m
         reference = without_jumps(course, scenario, cfg)
         places = reference.places_m(targets, ground)
         gaps_m, _ = signed_distances(obstacles, places, cfg.safety_distance_m)
@@ -229,20 +229,21 @@ def _watching(style: Style, scenario: Scenario, rng: np.random.Generator) -> np.
     """Draw a course, (n, 3), before the loss: at a bearing from the target, or behind it along its path."""
     targets = scenario.targets_m
     heading_rad = scenario.reference.heading_rad
-    apart_m = rng.uniform(*style.ground_distance_m)
+    drawn_m = rng.uniform(*style.ground_distance_m)
     altitude_m = rng.uniform(*style.altitude_m)
     bearing = rng.uniform(-np.pi, np.pi)
     follows_path = rng.random() < PATH_SHARE
     azimuth = heading_rad + bearing
-    aparts_m = np.full(len(targets), apart_m)
+    distance_m = np.full(len(targets), drawn_m)
     if follows_path:
+        # Where the target was `drawn_m` earlier on its path; at first, on the straight line behind its start.
         along_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(targets[:, :2], axis=0).T))])
-        start = -apart_m * np.array([np.cos(heading_rad[0]), np.sin(heading_rad[0])])
-        away = np.stack([np.interp(along_m - apart_m, along_m, targets[:, k]) for k in (0, 1)], axis=1)
-        away += np.clip(1.0 - along_m / apart_m, 0.0, 1.0)[:, None] * start - targets[:, :2]
+        start = -drawn_m * np.array([np.cos(heading_rad[0]), np.sin(heading_rad[0])])
+        away = np.stack([np.interp(along_m - drawn_m, along_m, targets[:, k]) for k in (0, 1)], axis=1)
+        away += np.clip(1.0 - along_m / drawn_m, 0.0, 1.0)[:, None] * start - targets[:, :2]
         azimuth = np.arctan2(away[:, 1], away[:, 0])
-        aparts_m = np.hypot(away[:, 0], away[:, 1])
-    return np.column_stack([azimuth, aparts_m, np.full(len(targets), altitude_m)])
+        distance_m = np.hypot(away[:, 0], away[:, 1])
+    return np.column_stack([azimuth, distance_m, np.full(len(targets), altitude_m)])
 
 
 def first_loss(seen: np.ndarray, dt_s: float, least_s: float = LOST_LEAST_S) -> int | None:
@@ -263,6 +264,7 @@ def finds_again(seen: np.ndarray, dt_s: float) -> bool:
 
 
 def _hidden_runs(seen: np.ndarray) -> list[tuple[int, int]]:
+    """Return begin and end of each run of frames in which the target is hidden."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], seen == 0, [0]]).astype(int)))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 

@@ -51,10 +51,10 @@ def smooth_trajectory(
     reference = scenario.reference
     dt_s = scenario.dt_s
     ahead = slice(scenario.start, None)
-    settled = 0
-    if scenario.turns_back:  # until `settled` the drone can neither follow the raw trajectory nor see as much
+    first_judged = 0  # the drone cannot see as much as the raw trajectory before this waypoint
+    if scenario.turns_back:
         change_m = np.linalg.norm(np.diff(raw[scenario.start - 1 : scenario.start + 2], n=2, axis=0))
-        settled = scenario.start + SETTLES * int(np.ceil(change_m / (cfg.accel_max_mps2 * dt_s**2)))
+        first_judged = scenario.start + SETTLES * int(np.ceil(change_m / (cfg.accel_max_mps2 * dt_s**2)))
     seen_raw = visibility(obstacles, raw, scenario.targets_m)
     astray_m = ASTRAY_SHARE * reference.distance_m
     band = smoothness_band(len(raw), dt_s)
@@ -63,10 +63,11 @@ def smooth_trajectory(
         points = _pulled_to(raw, pulls, band, scenario)
         blocked = np.zeros(len(raw), dtype=bool)
         blocked[ahead] = unsafe(points[ahead], obstacles, clearance_m, cfg.speed_max_mps * dt_s)
+        # How much each waypoint has to be pulled, from 0 to 1: by its loss of visibility, or fully if it is astray.
         lost = np.maximum(seen_raw - visibility(obstacles, points, scenario.targets_m), 0.0) * reference.keeps_sight
         lost = np.maximum(lost, np.linalg.norm(points - raw, axis=1) > astray_m)
         lost[(lost < VISIBILITY_LOSS) | (pulls >= PULL_FOR_VISIBILITY_MAX)] = 0.0
-        lost[:settled] = 0.0
+        lost[:first_judged] = 0.0
         is_smooth = not blocked.any()
         if is_smooth and (num_rounds >= ROUNDS or not lost.any()):
             break
@@ -85,17 +86,18 @@ def repair_to_limits(points: np.ndarray, scenario: Scenario, obstacles: BoxIndex
     pulls = np.full(len(points), PULL_FIXED)
     band = smoothness_band(len(points), scenario.dt_s)
     least_m = cfg.relaxed_safety_m - CLEARANCE_TOLERANCE_M
+    required_m = cfg.relaxed_safety_m + AWAY_M
     for _ in range(REPAIRS_MAX):
-        written = np.round(points, 4)
+        written = np.round(points, 4)  # as in the file
         exceeding = exceeds_limits(written, cfg, scenario.dt_s, len(scenario.past_m))
-        gaps_m, shares, boxes = swept_distances(obstacles, written, cfg.relaxed_safety_m + AWAY_M)
+        gaps_m, shares, boxes = swept_distances(obstacles, written, required_m)
         gaps_m[: scenario.start] = np.inf
         if not (exceeding.any() or (gaps_m < least_m).any()):
             return points
-        near = np.flatnonzero((gaps_m < cfg.relaxed_safety_m + AWAY_M) & (boxes >= 0))
+        near = np.flatnonzero((gaps_m < required_m) & (boxes >= 0))  # steps, by their first waypoint
         after = np.minimum(near + 1, len(points) - 1)
-        places = written[near] + shares[near, None] * (written[after] - written[near])
-        away = normals(obstacles, places, boxes[near]) * (cfg.relaxed_safety_m + AWAY_M - gaps_m[near])[:, None]
+        nearest_places = written[near] + shares[near, None] * (written[after] - written[near])
+        away = normals(obstacles, nearest_places, boxes[near]) * (required_m - gaps_m[near])[:, None]
         for ends in (near, after):
             np.add.at(goal, ends, away)
         pulls = pulls / PULL_RISE ** _spread(exceeding, SPREAD_S / scenario.dt_s)

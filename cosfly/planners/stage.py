@@ -111,24 +111,27 @@ def plan_trajectory(
     styles = styles or draw_styles_of([pedestrian], cfg, seed)[0]
     for attempt in range(TRIES):
         maneuvers = draw_maneuvers(styles, scenario, obstacles, screens, cfg, style_rng(pedestrian, seed, attempt))
-        trace = None
-        no_path = None
+        trace: DroneTrace | None = None
+        no_path: NoPathError | None = None
         try:
             trace = _plan_once(pedestrian, scenario, maneuvers, obstacles, screens, cfg, seed)
         except NoPathError as error:
             no_path = error
-        if not maneuvers.segments or (trace and trace.drop_reason is None):
-            break
+        if trace is not None and trace.drop_reason is None:
+            return trace
+        if not maneuvers.segments:
+            break  # `follow` has nothing to draw again
         styles = mirrored(styles)  # a wall may block one side only
-    has_no_fallback = not maneuvers.segments or cfg.styles_fallback == "drop"
-    if trace and (has_no_fallback or trace.drop_reason is None):
+    if not maneuvers.segments or cfg.styles_fallback == "drop":
+        if no_path is not None:
+            raise no_path
+        assert trace is not None
         return trace
-    if no_path and has_no_fallback:
-        raise no_path
     follow = _plan_once(pedestrian, scenario, ManeuverPlan(scenario.reference), obstacles, screens, cfg, seed)
     failed_styles = ", ".join(segment.style for segment in maneuvers.segments)
-    reason = trace.drop_reason if trace else "no_path"
-    return replace(follow, instead_of=f"{failed_styles}: {reason}", not_held=trace.not_held if trace else None)
+    if trace is None:
+        return replace(follow, instead_of=f"{failed_styles}: no_path")
+    return replace(follow, instead_of=f"{failed_styles}: {trace.drop_reason}", not_held=trace.not_held)
 
 
 def plan_on(
@@ -160,8 +163,10 @@ def plan_on(
 def style_rng(
     pedestrian: PedestrianTrajectory, seed: int, attempt: int = 0, *, purpose: str = "style"
 ) -> np.random.Generator:
-    """Return the random generator of a trajectory's styles or gimbal; it depends on the position of the pedestrian's
-    start, because pedestrian trajectories of different maps have equal ids."""
+    """Return the random generator of a trajectory's styles or gimbal.
+
+    It depends on where the pedestrian starts, because pedestrian trajectories of different maps have equal ids.
+    """
     x_m, y_m = np.round(pedestrian.positions_m[0, :2], 2) + 0.0
     return rng_for(seed, purpose, f"{pedestrian.path_id}/{x_m:.2f}/{y_m:.2f}" + (f"/{attempt}" if attempt else ""))
 
@@ -191,13 +196,14 @@ def _plan_once(
             expected=f"at least {cfg.relaxed_safety_m:g} m everywhere (plan.relaxed_safety_m)",
         )
     seen = visibility(obstacles, positions, targets)
-    is_judged = maneuvers.reference.keeps_sight
     seen_past_screens = visibility(screens, positions, targets) if maneuvers.searches else seen
     gimbal_rng = style_rng(pedestrian, seed, purpose="gimbal")
     pitch, yaw = view_of(maneuvers, positions, targets, seen_past_screens, scenario.dt_s, cfg, gimbal_rng)
-    counted = seen[is_judged] if is_judged.any() else seen
-    metrics = trajectory_metrics(positions, targets, counted, clearances, scenario.ground_m, scenario.dt_s)
-    reason = drop_reason(metrics, cfg, plan.is_converged, checks_visibility=bool(is_judged.any()))
+    # Only frames in which the target must be visible are judged by it; without such frames, all are measured.
+    keeps_sight = maneuvers.reference.keeps_sight
+    measured = seen[keeps_sight] if keeps_sight.any() else seen
+    metrics = trajectory_metrics(positions, targets, measured, clearances, scenario.ground_m, scenario.dt_s)
+    reason = drop_reason(metrics, cfg, plan.is_converged, checks_visibility=bool(keeps_sight.any()))
     reason = reason or why_not_held(maneuvers, scenario, positions, seen_past_screens)
     return DroneTrace(
         path_id=pedestrian.path_id, planner=cfg.planner, time_s=pedestrian.time_s, positions_m=positions,
@@ -259,7 +265,7 @@ def warm_up(cfg: PlanConfig) -> None:
     from cosfly.geometry.kernels import index_boxes
 
     steps = np.arange(8.0)
-    positions = np.column_stack([0.5 * steps, np.zeros(8), np.zeros(8)])
+    positions = np.column_stack([0.5 * steps, 0.0 * steps, 0.0 * steps])
     # One box hides the pedestrian from behind, so that the search for a start is compiled too.
     obstacles = index_boxes(np.array([[-10.0, 0.0, 15.0]]), np.array([[1.0, 3.0, 15.0]]), np.eye(3)[None])
     pedestrian = PedestrianTrajectory("warm-up", positions[:, :2], DT_S * steps, positions, np.ones(8))
@@ -276,7 +282,8 @@ def read_inputs(simplified_map: Path, paths: Path) -> tuple[BoxMap, list[Pedestr
         )
     (path_id, count), *_ = Counter(pedestrian.path_id for pedestrian in pedestrians).most_common(1)
     if count > 1:
-        what, fix = "several pedestrian trajectories have the same id", "run the pedestrians stage again"
+        what = "several pedestrian trajectories have the same id"
+        fix = "run the pedestrians stage again"
         raise InputError(what, where=where, got=path_id, expected="a different id for each of them", fix=fix)
     return box_map, pedestrians
 
@@ -336,12 +343,18 @@ def _styles_flown(traces: list[DroneTrace]) -> dict:
     styled = [trace for trace in traces if trace.segments or trace.instead_of]
     if not styled:
         return {}
-    parts = [part.style for trace in traces if not trace.drop_reason for part in trace.segments]
-    not_held = [trace.instead_of for trace in styled if trace.instead_of]
-    dropped = [f"{', '.join(p.style for p in t.segments)}: {t.drop_reason}" for t in styled if t.drop_reason]
+    kept, as_follow, dropped = Counter[str](), Counter[str](), Counter[str]()
+    for trace in styled:
+        styles = [segment.style for segment in trace.segments]
+        if trace.drop_reason:
+            dropped[f"{', '.join(styles)}: {trace.drop_reason}"] += 1
+        else:
+            kept.update(styles)
+        if trace.instead_of:
+            as_follow[trace.instead_of] += 1
     return {
-        "styles": dict(sorted(Counter(parts).items())),
-        "styles_flown_as_follow": dict(sorted(Counter(not_held).items())),
-        "styles_dropped": dict(sorted(Counter(dropped).items())),
+        "styles": dict(sorted(kept.items())),
+        "styles_flown_as_follow": dict(sorted(as_follow.items())),
+        "styles_dropped": dict(sorted(dropped.items())),
         "styles_not_held": {trace.path_id: trace.not_held for trace in styled if trace.not_held},
     }

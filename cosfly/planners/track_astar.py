@@ -28,10 +28,8 @@ from cosfly.planners.smoothing import smooth_trajectory
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import NoPathError
 
-# --- search, compiled -------------------------------------------------------------------------------------------------
-
+MAX_CELLS = 4_000_000  # a pedestrian trajectory of 50-100 m needs about 50 000
 ALTITUDE_ROUNDING_M = 1e-6
-
 # The 26 neighbours of a voxel and itself.
 MOVES = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.int64)
 BENDS = ((MOVES[:, None] - MOVES) ** 2).sum(axis=2).astype(np.float64)  # squared change between each two, in voxels
@@ -40,6 +38,11 @@ UNKNOWN, FREE, BLOCKED = range(3)  # edges between voxels
 
 WEIGHTS = ("tracking", "visibility", "path", "safety", "smoothness")
 TRACKING, VISIBILITY, PATH, SAFETY, SMOOTHNESS = range(5)
+
+# --- search, compiled -------------------------------------------------------------------------------------------------
+# A cell is the number of a voxel. Arrays that the functions of the search share: best: (cells,) cost of the cheapest
+# move to a cell in this layer, infinite for others. came_from, came_by: (cells,) place of its source in the beam of the
+# previous layer, and the move, as an index of MOVES. touched: (cells,) the cells reached in this layer.
 
 
 class Voxels(NamedTuple):
@@ -57,16 +60,16 @@ class Voxels(NamedTuple):
 class Costs(NamedTuple):
     """Weights and lengths of the search; m time layers."""
 
-    weights: np.ndarray  # (5,), indices below
+    weights: np.ndarray  # (5,), in the order of WEIGHTS
     ring_m: np.ndarray  # (m,) preferred distance in the plane
     requested: np.ndarray  # (m, 2) reference position in the plane; NaN if every position on the ring is allowed
     sight: np.ndarray  # (m,) weight of the blocked part of the rays
     least_z: np.ndarray  # (m,)
     preferred_z: np.ndarray  # (m,)
     greatest_z: np.ndarray  # (m,)
-    influence_m: float
-    safety_m: float
-    start: np.ndarray  # (3,)
+    influence_m: float  # obstacles nearer than this add to the safety term
+    safety_m: float  # a voxel nearer to an obstacle is closed
+    start: np.ndarray  # (3,) reference position at the first layer
 
 
 @njit(cache=True)
@@ -76,75 +79,86 @@ def search_layers(targets, reaches_m, voxels, costs, index, beam, corridor_m):
     targets: (m, 3) hip points of the layers. reaches_m: (m,) longest move into each layer.
     """
     num_layers, num_cells = len(targets), len(voxels.clearances)
-    cells, parents = np.empty((num_layers, beam), dtype=np.int64), np.empty((num_layers, beam), dtype=np.int64)
+    cells = np.empty((num_layers, beam), dtype=np.int64)  # the beam of each layer
+    parents = np.empty((num_layers, beam), dtype=np.int64)  # places in the beam of the previous layer
+    size = 0  # of the beam of the previous layer
+    cost_before = np.empty(beam)  # of each cell in that beam
+    move_before = np.empty(beam, dtype=np.int64)  # that led to each cell in that beam
     best = np.full(num_cells, np.inf)
-    came_from, came_by = np.empty(num_cells, dtype=np.int64), np.empty(num_cells, dtype=np.int64)
+    came_from = np.empty(num_cells, dtype=np.int64)
+    came_by = np.empty(num_cells, dtype=np.int64)
     touched = np.empty(num_cells, dtype=np.int64)
     num_seen = 0
-    cost_before, move_before = np.empty(beam), np.empty(beam, dtype=np.int64)
-    size = 0
     for layer in range(num_layers):
         if layer == 0:
-            num = _first_layer(targets[0], voxels, costs, index, corridor_m, best, came_from, came_by, touched)
+            num_touched = _first_layer(targets[0], voxels, costs, index, corridor_m, best, came_from, came_by, touched)
         else:
-            num = _expand(
+            num_touched = _expand(
                 cells[layer - 1, :size], cost_before, move_before, layer, reaches_m[layer], voxels, costs, index, best,
                 came_from, came_by, touched,
             )  # fmt: skip
-        chosen, total, seen = _choose(touched[:num], best, targets[layer], layer, voxels, costs, index, beam)
+        chosen, total, seen = _choose(touched[:num_touched], best, targets[layer], layer, voxels, costs, index, beam)
         num_seen += seen
         size = len(chosen)
         if size == 0:
             return np.full(num_layers, -1, dtype=np.int64), np.inf, num_seen
-        for b in range(size):
-            cells[layer, b], parents[layer, b] = chosen[b], came_from[chosen[b]]
-            cost_before[b], move_before[b] = total[b], came_by[chosen[b]]
-        for place in range(num):
-            best[touched[place]] = np.inf
+        for place in range(size):
+            cells[layer, place] = chosen[place]
+            parents[layer, place] = came_from[chosen[place]]
+            cost_before[place] = total[place]
+            move_before[place] = came_by[chosen[place]]
+        for k in range(num_touched):
+            best[touched[k]] = np.inf
     way = np.empty(num_layers, dtype=np.int64)
-    b = int(np.argmin(cost_before[:size]))
-    cost = cost_before[b]
+    place = int(np.argmin(cost_before[:size]))
+    cost = cost_before[place]
     for layer in range(num_layers - 1, -1, -1):
-        way[layer] = cells[layer, b]
-        b = parents[layer, b]
+        way[layer] = cells[layer, place]
+        place = parents[layer, place]
     return way, cost, num_seen
 
 
 @njit(cache=True)
 def _first_layer(target, voxels, costs, index, corridor_m, best, came_from, came_by, touched):
     """Put the free cells around the first target into `touched`; they cost the distance from the reference start."""
-    num_y, num_z, num = voxels.shape[1], voxels.shape[2], 0
+    num_y, num_z = voxels.shape[1], voxels.shape[2]
+    num_touched = 0
     for ix in range(voxels.shape[0]):
         for iy in range(num_y):
-            x, y = voxels.low[0] + ix * voxels.size[0], voxels.low[1] + iy * voxels.size[1]
+            x = voxels.low[0] + ix * voxels.size[0]
+            y = voxels.low[1] + iy * voxels.size[1]
             if (x - target[0]) ** 2 + (y - target[1]) ** 2 > corridor_m * corridor_m or not voxels.columns[ix, iy]:
                 continue
             for iz in range(num_z):
-                cell, z = (ix * num_y + iy) * num_z + iz, voxels.low[2] + iz * voxels.size[2]
+                cell = (ix * num_y + iy) * num_z + iz
+                z = voxels.low[2] + iz * voxels.size[2]
                 if not _is_in_bounds(z, costs, 0) or _clearance(cell, voxels, costs, index) < costs.safety_m:
                     continue
                 away = np.sqrt((x - costs.start[0]) ** 2 + (y - costs.start[1]) ** 2 + (z - costs.start[2]) ** 2)
                 best[cell] = costs.weights[PATH] * away / voxels.size[0]
-                came_from[cell], came_by[cell], touched[num] = -1, STAY, cell
-                num += 1
-    return num
+                came_from[cell] = -1
+                came_by[cell] = STAY
+                touched[num_touched] = cell
+                num_touched += 1
+    return num_touched
 
 
 @njit(cache=True)
 def _expand(sources, cost_before, moved, layer, reach_m, voxels, costs, index, best, came_from, came_by, touched):
     """Put the reachable cells into `touched`, the cheapest move there into `best`, `came_from` and `came_by`."""
     lengths = voxels.lengths
-    num_x, num_y, num_z, num = voxels.shape[0], voxels.shape[1], voxels.shape[2], 0
-    for b in range(len(sources)):
-        cell = sources[b]
+    num_x, num_y, num_z = voxels.shape[0], voxels.shape[1], voxels.shape[2]
+    num_touched = 0
+    for place in range(len(sources)):
+        cell = sources[place]
         ix, iy, iz = cell // (num_y * num_z), (cell // num_z) % num_y, cell % num_z
         for move in range(len(MOVES)):
             jx, jy, jz = ix + MOVES[move, 0], iy + MOVES[move, 1], iz + MOVES[move, 2]
             if lengths[move] > reach_m + 1e-9 or not (0 <= jx < num_x and 0 <= jy < num_y and 0 <= jz < num_z):
                 continue
             there = (jx * num_y + jy) * num_z + jz
-            cost = cost_before[b] + costs.weights[PATH] * lengths[move] / voxels.size[0]
-            cost += costs.weights[SMOOTHNESS] * BENDS[moved[b], move]
+            cost = cost_before[place] + costs.weights[PATH] * lengths[move] / voxels.size[0]
+            cost += costs.weights[SMOOTHNESS] * BENDS[moved[place], move]
             if cost >= best[there] or not voxels.columns[jx, jy]:
                 continue
             if not _is_in_bounds(voxels.low[2] + jz * voxels.size[2], costs, layer):
@@ -154,10 +168,12 @@ def _expand(sources, cost_before, moved, layer, reach_m, voxels, costs, index, b
             if voxels.edges[cell, move] == BLOCKED:
                 continue
             if best[there] == np.inf:
-                touched[num] = there
-                num += 1
-            best[there], came_from[there], came_by[there] = cost, b, move
-    return num
+                touched[num_touched] = there
+                num_touched += 1
+            best[there] = cost
+            came_from[there] = place
+            came_by[there] = move
+    return num_touched
 
 
 @njit(cache=True)
@@ -166,22 +182,7 @@ def _choose(touched, best, target, layer, voxels, costs, index, beam):
 
     Visibility is computed only where the cost without it is within the beam.
     """
-    bounds = np.empty(len(touched))  # costs if the target is visible
-    reach_m = 0.0
-    for k in range(len(touched)):
-        cell = touched[k]
-        x, y, z = _place(cell, voxels)
-        away = np.sqrt((x - target[0]) ** 2 + (y - target[1]) ** 2)
-        reach_m = max(reach_m, away)
-        aside = away - costs.ring_m[layer]
-        requested_x, requested_y = costs.requested[layer, 0], costs.requested[layer, 1]
-        if not np.isnan(requested_x):
-            aside = np.sqrt((x - requested_x) ** 2 + (y - requested_y) ** 2)
-        climb = z - costs.preferred_z[layer]
-        gap = voxels.clearances[cell]  # computed by the expansion
-        near = max(0.0, 1.0 - gap / costs.influence_m)
-        off = costs.weights[TRACKING] * np.sqrt(aside * aside + climb * climb) / voxels.size[0]
-        bounds[k] = best[cell] + off + costs.weights[SAFETY] * near * near
+    bounds, reach_m = _costs_if_visible(touched, best, target, layer, voxels, costs)
     horizon = make_horizon(index, target, reach_m, 0.0)
     total = np.full(len(touched), np.inf)
     num = 0
@@ -210,6 +211,28 @@ def _choose(touched, best, target, layer, voxels, costs, index, beam):
     return chosen[:size], chosen_costs[:size], num
 
 
+@njit(cache=True)
+def _costs_if_visible(touched, best, target, layer, voxels, costs):
+    """Return the cost of each cell from which the target is visible, and the largest distance to the target, m."""
+    totals = np.empty(len(touched))
+    reach_m = 0.0
+    for k in range(len(touched)):
+        cell = touched[k]
+        x, y, z = _place(cell, voxels)
+        away = np.sqrt((x - target[0]) ** 2 + (y - target[1]) ** 2)
+        reach_m = max(reach_m, away)
+        aside = away - costs.ring_m[layer]
+        requested_x, requested_y = costs.requested[layer, 0], costs.requested[layer, 1]
+        if not np.isnan(requested_x):
+            aside = np.sqrt((x - requested_x) ** 2 + (y - requested_y) ** 2)
+        climb = z - costs.preferred_z[layer]
+        gap = voxels.clearances[cell]  # computed by the expansion
+        near = max(0.0, 1.0 - gap / costs.influence_m)
+        off = costs.weights[TRACKING] * np.sqrt(aside * aside + climb * climb) / voxels.size[0]
+        totals[k] = best[cell] + off + costs.weights[SAFETY] * near * near
+    return totals, reach_m
+
+
 @njit(cache=True, inline="always")
 def _is_in_bounds(z, costs, layer):
     """Return whether a height keeps the altitudes of a layer."""
@@ -218,12 +241,14 @@ def _is_in_bounds(z, costs, layer):
 
 @njit(cache=True, inline="always")
 def _look(cell, voxels, index, horizon, target):
+    """Return the five-ray visibility of the target from a cell."""
     x, y, z = _place(cell, voxels)
     return five_ray_visibility(index, horizon, target, x, y, z)
 
 
 @njit(cache=True, inline="always")
 def _place(cell, voxels):
+    """Return the centre of a cell, x, y, z in m."""
     num_y, num_z = voxels.shape[1], voxels.shape[2]
     return (
         voxels.low[0] + (cell // (num_y * num_z)) * voxels.size[0],
@@ -257,7 +282,7 @@ def _edge_is_free(cell, there, voxels, costs, index):
     return collect_hits(index, ax, ay, az, bx, by, bz, costs.safety_m, np.empty(1, dtype=np.int64)) == 0
 
 
-MAX_CELLS = 4_000_000  # a pedestrian trajectory of 50-100 m needs about 50 000
+# --- planner ----------------------------------------------------------------------------------------------------------
 
 
 def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:

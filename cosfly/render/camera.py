@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -42,20 +42,20 @@ def view_target(target_m: np.ndarray, camera_pose: np.ndarray, camera: Camera) -
     uv, z = project(np.asarray(target_m)[None], camera_pose, camera.intrinsic)
     corners = box_corners(target_m, np.array(PERSON_HALF_EXTENTS_M))
     corners = (corners - camera_pose[:3, 3]) @ camera_pose[:3, :3]
-    seen = [corner for corner in corners if corner[2] >= NEAR_M]  # corners of the part beyond the near plane
+    points = [corner for corner in corners if corner[2] >= NEAR_M]  # corners of the part beyond the near plane
     for a, b in EDGES:
         za, zb = corners[a, 2], corners[b, 2]
         if (za < NEAR_M) != (zb < NEAR_M):
-            seen.append(corners[a] + (corners[b] - corners[a]) * (NEAR_M - za) / (zb - za))
-    box = clipped = np.full(4, np.nan)
-    if seen:
-        points = np.array(seen) @ camera.intrinsic.T
-        points = points[:, :2] / points[:, 2:]
-        box = np.array([*points.min(axis=0), *points.max(axis=0)])
-        clipped = np.clip(box, 0.0, [camera.width_px, camera.height_px] * 2)
-        if (clipped[2:] <= clipped[:2]).any():
-            clipped = np.full(4, np.nan)
-    return TargetView(uv[0], float(z[0]), box, clipped)
+            points.append(corners[a] + (corners[b] - corners[a]) * (NEAR_M - za) / (zb - za))
+    nowhere = np.full(4, np.nan)
+    if not points:
+        return TargetView(uv[0], float(z[0]), nowhere, nowhere)
+    projected = np.array(points) @ camera.intrinsic.T
+    pixels = projected[:, :2] / projected[:, 2:]
+    box = np.array([*pixels.min(axis=0), *pixels.max(axis=0)])
+    clipped = np.clip(box, 0.0, [camera.width_px, camera.height_px] * 2)
+    is_outside = (clipped[2:] <= clipped[:2]).any()
+    return TargetView(uv[0], float(z[0]), box, nowhere if is_outside else clipped)
 
 
 def box_depths(
@@ -64,7 +64,10 @@ def box_depths(
     """Return the depth at which rays enter an axis-aligned box.
 
     Args:
-        pixels: (n, 2) px; center_m, half_m: (3,) world; camera_pose: (4, 4) world_from_camera; intrinsic: (3, 3).
+        pixels: (n, 2) px.
+        center_m, half_m: (3,) world.
+        camera_pose: (4, 4) world_from_camera.
+        intrinsic: (3, 3).
     Returns:
         (n,) z-depth in m, at least NEAR_M; infinity where the ray misses the box.
     Source: slab method, Kay and Kajiya 1986; rays have camera z = 1, so that their parameter is z-depth.
@@ -78,21 +81,25 @@ def box_depths(
     return np.where(leave > enter, enter, np.inf)
 
 
+class RenderedVisibility(NamedTuple):
+    """Shares of the target's projected 3D box, each in [0, 1]. The rest of it lies outside the image."""
+
+    score: float  # that nothing hides
+    hidden_by_bystanders: float
+    hidden_by_map: float
+
+
 def rendered_visibility(
     frame: Frame, target_m: np.ndarray, view: TargetView, camera_pose: np.ndarray, camera: Camera,
     other_ids: np.ndarray = NO_IDS,
-) -> tuple[float, float, float]:  # fmt: skip
+) -> RenderedVisibility:  # fmt: skip
     """Return how much of the target a frame shows.
 
-    The score is the share of the target's projected 3D box that nothing hides: at each pixel centre the depth of the
-    box's near side is compared with the depth image; where the person itself was drawn the box is visible. The part
-    outside the image counts as hidden.
-
-    Returns:
-        Score, share that bystanders (`other_ids`) hide, share that the map hides, each in [0, 1].
+    At each pixel centre the depth of the box's near side is compared with the depth image. Where the person itself was
+    drawn the box is visible. other_ids: instance ids of bystanders.
     """
     if not view.in_view:
-        return 0.0, 0.0, 0.0
+        return RenderedVisibility(0.0, 0.0, 0.0)
     x0, y0, x1, y1 = view.box_px
     # A box that reaches far beyond the image does not need a ray for each of its pixels.
     stride = max(1.0, float(np.sqrt((x1 - x0) * (y1 - y0) / MOST_SAMPLES)))
@@ -101,39 +108,44 @@ def rendered_visibility(
     pixels = np.stack(np.meshgrid(np.floor(columns), np.floor(rows)), axis=-1).reshape(-1, 2)
     half_m = np.array(PERSON_HALF_EXTENTS_M)
     near = box_depths(pixels + 0.5, np.asarray(target_m), half_m, camera_pose, camera.intrinsic)
-    pixels, near = pixels[np.isfinite(near)].astype(np.int64), near[np.isfinite(near)]
-    if len(pixels) == 0:
-        return 0.0, 0.0, 0.0
-    inside = ((pixels >= 0) & (pixels < [camera.width_px, camera.height_px])).all(axis=1)
-    at = pixels[inside, 1], pixels[inside, 0]
-    is_free = (frame.depth[at] >= near[inside] - DEPTH_TOLERANCE_M) | (frame.ids[at] == PERSON_ID)
+    is_in_box = np.isfinite(near)
+    near = near[is_in_box]
+    pixels = pixels[is_in_box].astype(np.int64)
+    num = len(pixels)
+    if num == 0:
+        return RenderedVisibility(0.0, 0.0, 0.0)
+    is_inside = ((pixels >= 0) & (pixels < [camera.width_px, camera.height_px])).all(axis=1)
+    columns, rows = pixels[is_inside].T
+    is_free = frame.depth[rows, columns] >= near[is_inside] - DEPTH_TOLERANCE_M
+    is_free |= frame.ids[rows, columns] == PERSON_ID
     num_free = np.count_nonzero(is_free)
-    num_others = np.count_nonzero(np.isin(frame.ids[at][~is_free], other_ids))
-    num_map = len(is_free) - num_free - num_others
-    return num_free / len(pixels), num_others / len(pixels), num_map / len(pixels)
+    num_others = np.count_nonzero(np.isin(frame.ids[rows, columns][~is_free], other_ids))
+    return RenderedVisibility(num_free / num, num_others / num, (len(is_free) - num_free - num_others) / num)
 
 
 def contrast_of(rgb: np.ndarray, is_person: np.ndarray) -> float | None:
     """Return the contrast of a person to its surroundings: CIE76, the greater of the upper and the lower half.
 
     Args:
-        rgb: (h, w, 3) uint8; is_person: (h, w) bool.
+        rgb: (h, w, 3) uint8.
+        is_person: (h, w) bool.
     Returns:
         None where no pixel is the person's, or none is around it.
     """
     if not is_person.any():
         return None
     x0, y0, x1, y1 = mask_box(is_person).astype(int).tolist()
-    around = max(RING_LEAST_PX, (y1 - y0) // 2)
-    part = np.s_[max(0, y0 - around) : y1 + around, max(0, x0 - around) : x1 + around]
-    colours = cv2.cvtColor(rgb[part].astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
-    inside = is_person[part]
-    is_upper = np.arange(part[0].start, part[0].start + len(inside))[:, None] < (y0 + y1) / 2
-    halves = [half for half in (inside & is_upper, inside & ~is_upper) if half.any()]
-    if inside.all():
+    ring_px = max(RING_LEAST_PX, (y1 - y0) // 2)
+    top = max(0, y0 - ring_px)
+    part = np.s_[top : y1 + ring_px, max(0, x0 - ring_px) : x1 + ring_px]
+    is_inside = is_person[part]
+    if is_inside.all():
         return None
-    ground = colours[~inside].mean(axis=0)
-    return max(float(np.linalg.norm(colours[half].mean(axis=0) - ground)) for half in halves)
+    colours = cv2.cvtColor(rgb[part].astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
+    surroundings = colours[~is_inside].mean(axis=0)
+    is_upper = np.arange(top, top + len(is_inside))[:, None] < (y0 + y1) / 2
+    halves = [half for half in (is_inside & is_upper, is_inside & ~is_upper) if half.any()]
+    return max(float(np.linalg.norm(colours[half].mean(axis=0) - surroundings)) for half in halves)
 
 
 def legibility(meta: TargetMeta, contrast: float | None) -> dict[str, float | bool | None]:
@@ -172,23 +184,28 @@ def zoomed_deg(
     segments: Sequence[Segment],
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Return fields of view, (n,) degrees, that go from part to part to another level, if there is one.
+    """Return the field of view at each time, (n,) degrees; each part of the trajectory has another level if possible.
 
     Within a change the picture grows by equal factors in equal times, with smooth ends.
 
     Args:
-        first_deg: The level of the first part. fovs_deg: All levels. time_s: (n,). rng: Draws the other levels.
+        first_deg: The level of the first part.
+        fovs_deg: All levels.
+        time_s: (n,).
+        segments: The parts; without segments they are `zoom.part_s` long.
+        rng: Draws the other levels.
     """
     begins_s = np.arange(time_s[0] + zoom.part_s, time_s[-1], zoom.part_s).tolist()
     if segments:
         begins_s = [float(time_s[segment.begin]) for segment in segments if segment.begin > 0]
-    focal = np.full(len(time_s), np.log(focal_px(1, first_deg)))
-    level = first_deg
-    for begin_s, end_s in zip(begins_s, [*begins_s, float(time_s[-1])][1:], strict=True):
-        choices = [fov for fov in dict.fromkeys(fovs_deg) if fov != level] or [level]
-        following = choices[int(rng.integers(len(choices)))]
+    ends_s = [*begins_s, float(time_s[-1])][1:]
+    log_focal = np.full(len(time_s), np.log(focal_px(1, first_deg)))
+    level_deg = first_deg
+    for begin_s, end_s in zip(begins_s, ends_s, strict=True):
+        choices = [fov_deg for fov_deg in dict.fromkeys(fovs_deg) if fov_deg != level_deg] or [level_deg]
+        next_deg = choices[int(rng.integers(len(choices)))]
         duration_s = min(zoom.ramp_s, end_s - begin_s)
         share = np.clip(time_s - begin_s, 0.0, duration_s) / duration_s if duration_s > 0 else time_s >= begin_s
-        focal += np.log(focal_px(1, following) / focal_px(1, level)) * share**2 * (3.0 - 2.0 * share)
-        level = following
-    return np.degrees(2.0 * np.arctan(0.5 / np.exp(focal)))
+        log_focal += np.log(focal_px(1, next_deg) / focal_px(1, level_deg)) * share**2 * (3.0 - 2.0 * share)
+        level_deg = next_deg
+    return np.degrees(2.0 * np.arctan(0.5 / np.exp(log_focal)))

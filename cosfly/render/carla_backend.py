@@ -49,6 +49,15 @@ class CarlaRenderer(SimulatorRenderer):
 
     engine = "carla"
     port_step = 10  # a server takes three ports, from its own on
+    # The following belong to one connection; Any is a type of the package carla.
+    _server: CarlaConnection
+    _world: Any
+    _spectator: Any
+    _library: Any  # of blueprints
+    _cameras: dict[str, tuple[Any, queue.SimpleQueue]]  # by name in SENSORS: the sensor, and its pictures
+    _walkers: dict[int, Any]  # by instance id
+    _fov_deg: float  # of the cameras
+    _ids: np.ndarray  # as `_ids_in_pictures` returns it, and with the walkers
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._weather: WeatherParams | None = None
@@ -69,18 +78,20 @@ class CarlaRenderer(SimulatorRenderer):
                 world = self._world = self._server.world
                 settings = world.get_settings()
                 self._spectator = world.get_spectator()
-                found = self._spectator.get_transform()
-                place = [[found.location.x, found.location.y, found.location.z]]
-                place += [[found.rotation.pitch, found.rotation.yaw, found.rotation.roll]]
+                view = self._spectator.get_transform()
+                location = [view.location.x, view.location.y, view.location.z]
+                rotation = [view.rotation.pitch, view.rotation.yaw, view.rotation.roll]
                 weather = read_attributes(world.get_weather())
-                self._guard.note({"settings": read_attributes(settings), "weather": weather, "spectator": place})
+                self._guard.note(
+                    {"settings": read_attributes(settings), "weather": weather, "spectator": [location, rotation]}
+                )
                 settings.synchronous_mode = True
                 settings.spectator_as_ego = True  # the tiles of a large map are loaded around the spectator
                 settings.fixed_delta_seconds = SIMULATED_STEP_S
                 world.apply_settings(settings)
                 self._library = world.get_blueprint_library()
-                self._cameras: dict[str, tuple[Any, queue.SimpleQueue]] = {}
-                self._walkers: dict[int, Any] = {}
+                self._cameras = {}
+                self._walkers = {}
                 self._fov_deg = 0.0
                 self._ids = _ids_in_pictures(self._server, self._map, self._num_others)
         except Exception:
@@ -123,8 +134,8 @@ class CarlaRenderer(SimulatorRenderer):
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
         """Set the weather, and remove all people."""
         self._weather = weather
-        for number in list(self._walkers):
-            self._remove(number)
+        for instance_id in list(self._walkers):
+            self._remove(instance_id)
         self._set_weather()
 
     def _set_weather(self) -> None:
@@ -145,10 +156,10 @@ class CarlaRenderer(SimulatorRenderer):
         pose = self._transform(camera_pose[:3, 3], conventions.camera_rotation_deg(camera_pose))
         if fov_deg != self._fov_deg or not self._cameras:
             self._make_cameras(fov_deg, pose)
-        for number in self._walkers.keys() - people.keys():
-            self._remove(number)
-        for number, person in people.items():
-            self._place(number, person)
+        for instance_id in self._walkers.keys() - people.keys():
+            self._remove(instance_id)
+        for instance_id, person in people.items():
+            self._place(instance_id, person)
         for camera, _ in self._cameras.values():
             camera.set_transform(pose)
         self._spectator.set_transform(pose)
@@ -161,20 +172,20 @@ class CarlaRenderer(SimulatorRenderer):
         ids = self._ids[kinds.astype(np.int64) << 16 | actors]
         return far_as_sky(Frame(np.ascontiguousarray(pictures["rgb"][..., 2::-1]), depth, kinds, ids))
 
-    def _pictures(self, frame: int) -> dict[str, np.ndarray]:
-        """Wait for the picture of a tick from every camera, (h, w, 4) BGRA; earlier ones and doubles are ignored."""
+    def _pictures(self, tick: int) -> dict[str, np.ndarray]:
+        """Wait for the picture of a tick from every camera, (h, w, 4) BGRA; pictures of earlier ticks are ignored."""
         limit_s = PICTURE_SHARE * self._cfg.timeout_s
         pictures = {}
         until_s = time.monotonic() + limit_s
         for name, (_, inbox) in self._cameras.items():
             while name not in pictures:
                 try:
-                    number, data = inbox.get(timeout=max(0.0, until_s - time.monotonic()))
+                    picture_tick, data = inbox.get(timeout=max(0.0, until_s - time.monotonic()))
                 except queue.Empty:
                     raise NoPictureError(
-                        f"camera {name} sent no picture of tick {frame} in {limit_s:g} s; raise render.carla.timeout_s"
+                        f"camera {name} sent no picture of tick {tick} in {limit_s:g} s; raise render.carla.timeout_s"
                     ) from None
-                if number == frame:
+                if picture_tick == tick:
                     pictures[name] = np.frombuffer(data, np.uint8).reshape(*self._size_px[::-1], 4)
         return pictures
 
@@ -210,32 +221,34 @@ class CarlaRenderer(SimulatorRenderer):
 
     # --- people -------------------------------------------------------------------------------------------------------
 
-    def _place(self, number: int, person: PosedPerson) -> None:
+    def _place(self, instance_id: int, person: PosedPerson) -> None:
         """Put a person one step before the place, because the tick moves walkers there."""
         carla = self._server.carla
-        walker = self._walkers.get(number) or self._add(number, person)
-        position_m, turn_deg, ahead, speed_mps = placement_of(person, SIMULATED_STEP_S)
-        x, y, z = unreal_pose(ahead, turn_deg)[:3]
-        walker.apply_control(carla.WalkerControl(carla.Vector3D(x, y, z), speed_mps, False))
-        walker.set_transform(self._transform(position_m, turn_deg))
+        walker = self._walkers.get(instance_id) or self._add(instance_id, person)
+        placement = placement_of(person, SIMULATED_STEP_S)
+        x, y, z = unreal_pose(placement.ahead, placement.rotation_deg)[:3]
+        walker.apply_control(carla.WalkerControl(carla.Vector3D(x, y, z), placement.speed_mps, False))
+        walker.set_transform(self._transform(placement.hip_m, placement.rotation_deg))
 
-    def _add(self, number: int, person: PosedPerson) -> Any:
+    def _add(self, instance_id: int, person: PosedPerson) -> Any:
         """Spawn a walker by a person's clothes, and note the number of the actor in pictures."""
         names = sorted(blueprint.id for blueprint in self._library.filter("walker.pedestrian.*"))
         worn = dump_json(asdict(person.clothes.looks))
         name = names[int(sha256_bytes(worn.encode())[:8], 16) % len(names)]
-        walker = self._walkers[number] = self._spawned(self._library.find(name), self._far_up())
+        walker = self._spawned(self._library.find(name), self._far_up())
+        self._walkers[instance_id] = walker
         walker.set_collisions(False)
         walker.set_enable_gravity(False)
-        self._ids[PERSON_KEY | walker.id & ACTOR_BITS] = number
+        self._ids[PERSON_KEY | walker.id & ACTOR_BITS] = instance_id
         return walker
 
-    def _remove(self, number: int) -> None:
-        walker = self._walkers.pop(number)
+    def _remove(self, instance_id: int) -> None:
+        walker = self._walkers.pop(instance_id)
         self._ids[PERSON_KEY | walker.id & ACTOR_BITS] = NO_INSTANCE
         walker.destroy()
 
     def _spawned(self, blueprint: Any, transform: Any) -> Any:
+        """Spawn an actor that the guard destroys if this process ends early."""
         actor = self._world.spawn_actor(blueprint, transform)
         self._guard.note(actor.id)
         return actor
@@ -267,13 +280,14 @@ def _ids_in_pictures(server: CarlaConnection, box_map: BoxMap, num_others: int) 
         boxes = server.world.get_level_bbs(server.carla.CityObjectLabel.values[kind])
         if not boxes:
             continue
-        centers = [conventions.world_pose((b.location.x, b.location.y, b.location.z, 0.0, 0.0, 0.0))[0] for b in boxes]
+        places = (box.location for box in boxes)
+        centers = [conventions.world_pose((place.x, place.y, place.z, 0.0, 0.0, 0.0))[0] for place in places]
         gaps_m, nearest = cKDTree(np.array(centers)).query(box_map.centers[rows])
         actor_of_key: dict[int, int] = {}
         is_same = gaps_m <= SAME_BOX_M
-        for row, box in zip(rows[is_same].tolist(), nearest[is_same].tolist(), strict=True):
+        for row, k in zip(rows[is_same].tolist(), nearest[is_same].tolist(), strict=True):
             num_found += 1
-            actor = boxes[box].actor_id
+            actor = boxes[k].actor_id
             key = kind << 16 | actor & ACTOR_BITS
             if key not in actor_of_key:
                 actor_of_key[key] = actor

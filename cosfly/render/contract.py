@@ -177,25 +177,28 @@ def plants_of(centers_m: np.ndarray, half_m: np.ndarray, seeds: np.ndarray) -> t
     """Classify plants by the shapes of their boxes.
 
     Args:
-        centers_m, half_m: (n, 3); seeds: (n,), `seeds_of` their ids.
+        centers_m, half_m: (n, 3).
+        seeds: (n,), `seeds_of` their ids.
     Returns:
-        forms (n,), LAWN .. BROADLEAF; crown_low (n,): where foliage begins, in units of the half height, -1 the box's
-        bottom. Under it is a stem of `stem_radius_m` along the box's axis.
+        forms: (n,), LAWN .. BROADLEAF.
+        crown_low: (n,) where foliage begins, in units of the half height; -1 is the box's bottom. Under it is a stem of
+            `stem_radius_m` along the box's axis.
     """
     hx, hy, hz = half_m.T
     wide, narrow = np.maximum(hx, hy), np.minimum(hx, hy)
     is_lawn = hz < LAWN_HALF_M
-    is_hedge = (hz < 1.8) & (wide >= 0.45) & ((wide > 2.5 * narrow) | (wide > 4.0))
-    is_trunk = (hz >= 1.3) & (wide < 0.45) & (hz > 3.0 * wide)  # maps that keep trunk and crown apart
-    is_crown = np.zeros(len(centers_m), dtype=bool)  # of a trunk that is a box of its own
+    is_hedge = (hz < 1.8) & (wide >= 0.45) & ((wide > 2.5 * narrow) | (wide > 4.0))  # low, and long or wide
+    is_bush = hz < 1.3
+    is_trunk = ~is_bush & (wide < 0.45) & (hz > 3.0 * wide)  # thin: maps that keep trunk and crown apart
+    is_crown = np.zeros(len(centers_m), dtype=bool)  # over the foot of such a trunk nearby
     if is_trunk.any():
         from scipy.spatial import cKDTree  # takes half a second to import, which every command would pay
 
-        gap, nearest = cKDTree(centers_m[is_trunk, :2]).query(centers_m[:, :2])
-        foot = (centers_m[is_trunk, 2] - hz[is_trunk])[nearest]
-        is_crown = (gap < wide + 1.0) & (centers_m[:, 2] - hz > foot + 0.8)
-    is_conifer = (chance(seeds, 5) < 0.18) & (hz > 1.6 * wide)
-    is_form = [is_lawn, is_hedge, hz < 1.3, is_trunk, is_crown, is_conifer]
+        gap_m, nearest = cKDTree(centers_m[is_trunk, :2]).query(centers_m[:, :2])
+        foot_z_m = (centers_m[is_trunk, 2] - hz[is_trunk])[nearest]
+        is_crown = (gap_m < wide + 1.0) & (centers_m[:, 2] - hz > foot_z_m + 0.8)
+    is_conifer = (chance(seeds, 5) < 0.18) & (hz > 1.6 * wide)  # some of the slender trees
+    is_form = [is_lawn, is_hedge, is_bush, is_trunk, is_crown, is_conifer]
     forms = np.select(is_form, [LAWN, HEDGE, BUSH, TRUNK, CROWN, CONIFER], BROADLEAF)
     broadleaf_low = np.where(hz > wide, -0.38, -0.55)
     return forms, np.select([forms == BROADLEAF, forms == CONIFER], [broadleaf_low, CONIFER_LOW], -1.0)
@@ -208,7 +211,10 @@ def stem_radius_m(half_m: np.ndarray) -> np.ndarray:
 
 
 def seeds_of(ids: np.ndarray) -> np.ndarray:
-    """Return a fixed number in [0, 1) for each box id (splitmix64), so that a house keeps its colour between runs."""
+    """Return a fixed number in [0, 1) for each box id, so that a house keeps its colour between runs.
+
+    Source: splitmix64, Steele, Lea and Flood 2014.
+    """
     with np.errstate(over="ignore"):
         x = np.asarray(ids, dtype=np.uint64) + np.uint64(0x9E3779B97F4A7C15)
         x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

@@ -4,6 +4,7 @@ walking person as solids for any renderer."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT
 from cosfly.formats.people import COLORS, EMPTY_SHARE, FIGURES, GARMENTS, HAIR, Appearance, People
 from cosfly.geometry.axes import headings_of, rotation_matrices, rotation_matrix
 from cosfly.geometry.kernels import distances_to_boxes_m
+from cosfly.render.camera import RenderedVisibility
 from cosfly.render.contract import Clothes, Frame, PosedPeople, PosedPerson, other_id
 
 STRIDE_M = 1.35  # two steps
@@ -26,11 +28,11 @@ SHOES = np.array([[0.03, 0.025, 0.02], [0.55, 0.55, 0.53], [0.14, 0.07, 0.03]])
 
 def choose_clothes(rng: np.random.Generator, looks: Appearance | None = None) -> Clothes:
     """Choose clothes at random: an appearance, unless one is given, and the colours of hair, skin and shoes."""
-    looks = looks or draw_appearance(rng)
+    looks = looks or choose_appearance(rng)
     return Clothes(looks, *(palette[rng.integers(len(palette))] for palette in (HAIR_RGB, SKIN, SHOES)))
 
 
-def draw_appearance(rng: np.random.Generator) -> Appearance:
+def choose_appearance(rng: np.random.Generator) -> Appearance:
     """Choose an appearance at random, whose garments can all be seen.
 
     Garments and colours are equally likely; EMPTY_SHARE is the share of people without a hat or a bag.
@@ -43,7 +45,7 @@ def draw_appearance(rng: np.random.Generator) -> Appearance:
             return person
 
 
-def look_alike(person: Appearance, rng: np.random.Generator) -> Appearance:
+def choose_look_alike(person: Appearance, rng: np.random.Generator) -> Appearance:
     """Choose an appearance at random that differs from a given one in one garment or its colour."""
     slot = _choose(rng, tuple(GARMENTS))
     while True:
@@ -74,12 +76,12 @@ class Gait:
 
     def since(self, first: int) -> Gait:
         """Return the gait from frame `first` on."""
-        return Gait(*(values[first:] for values in vars(self).values()))
+        return Gait(self.headings_rad[first:], self.phases_rad[first:], self.swings[first:])
 
     def posed(self, i: int, hip_m: np.ndarray, clothes: Clothes) -> PosedPerson:
         """Return the person of frame i, at a hip point, (3,) world."""
-        heading_rad, phase_rad, swing = (float(values[i]) for values in vars(self).values())
-        return PosedPerson(hip_m, heading_rad, phase_rad, swing, clothes)
+        heading_rad = float(self.headings_rad[i])
+        return PosedPerson(hip_m, heading_rad, float(self.phases_rad[i]), float(self.swings[i]), clothes)
 
 
 def gait_of(targets_m: np.ndarray, time_s: np.ndarray) -> Gait:
@@ -114,9 +116,10 @@ class DressedBystanders:
 
     def dressed(self, instance_id: int, looks: Appearance) -> DressedBystanders:
         """Return the bystanders with one of them in another appearance."""
-        clothes = list(self.clothes)
-        number = other_id(0) - instance_id
-        clothes[number] = replace(clothes[number], looks=looks)
+        clothes = [
+            replace(worn, looks=looks) if other_id(number) == instance_id else worn
+            for number, worn in enumerate(self.clothes)
+        ]
         return replace(self, clothes=clothes)
 
     def posed(self, i: int) -> PosedPeople:
@@ -126,12 +129,12 @@ class DressedBystanders:
             for number, other in enumerate(self.others)
         }
 
-    def meta(self, i: int, frame: Frame, hidden_by_others: float, hidden_by_map: float) -> BystandersMeta:
-        """Return the annotation of the bystanders in frame i."""
+    def meta(self, i: int, frame: Frame, visibility: RenderedVisibility) -> BystandersMeta:
+        """Return the annotation of the bystanders in frame i; visibility: that of the target."""
         pixels = np.bincount(frame.ids.ravel(), minlength=other_id(0) + 1)
         return BystandersMeta(
-            target_hidden_by_others=round(hidden_by_others, SHARE_DIGITS),
-            target_hidden_by_map=round(hidden_by_map, SHARE_DIGITS),
+            target_hidden_by_others=round(visibility.hidden_by_bystanders, SHARE_DIGITS),
+            target_hidden_by_map=round(visibility.hidden_by_map, SHARE_DIGITS),
             others=[
                 BystanderMeta(
                     instance_id=other_id(number),
@@ -166,21 +169,34 @@ def dress_bystanders(
     for other in others:
         looks = target
         while not target.differences(looks):
-            looks = look_alike(target, rng) if other.is_look_alike else draw_appearance(rng)
+            looks = choose_look_alike(target, rng) if other.is_look_alike else choose_appearance(rng)
         clothes.append(choose_clothes(rng, looks))
     return DressedBystanders(others, gaits, clothes)
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
 
-# A figure of 1.8 m stays within the circle around the target's box (PERSON_HALF_EXTENTS_M), to 3 mm.
+# Lengths in this section are m, of a figure of 1.8 m, in the person's own axes: x forward, y left, z up, feet at 0. The
+# figure stays within the circle around the target's box (PERSON_HALF_EXTENTS_M), to 3 mm.
 HIP_SWING_RAD, ARM_SWING_RAD, KNEE_BEND_RAD = 0.25, 0.38, 0.65  # largest angles of a stride
 HIP_M, KNEE_M, ANKLE_M, SHOULDER_M = 0.93, 0.50, 0.085, 1.45  # heights of joints
 SIZES = {"woman": 0.96, "man": 1.0}
 BREADTHS = {"woman": 0.84, "man": 1.05}
 LIMB_OVERLAP = 0.6  # a limb reaches beyond its joints by this share of its radius
-# Garments that hang open below the waist: low end, high end, radii ahead and aside, m.
-HEMS = {"jacket": (0.82, 1.12, 0.15, 0.19), "coat": (0.46, 1.14, 0.22, 0.235), "skirt": (0.47, 1.04, 0.24, 0.26)}
+
+
+class Hem(NamedTuple):
+    """A garment that hangs open below the waist."""
+
+    low: float
+    high: float
+    ahead: float  # radius
+    aside: float  # radius
+
+
+HEMS = {
+    "jacket": Hem(0.82, 1.12, 0.15, 0.19), "coat": Hem(0.46, 1.14, 0.22, 0.235), "skirt": Hem(0.47, 1.04, 0.24, 0.26)
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -194,29 +210,50 @@ class PersonFigure:
     colors: np.ndarray  # (k, 3) linear RGB
 
 
+class _Solid(NamedTuple):
+    """A piece of a figure that is not a limb."""
+
+    shape: str
+    center: list[float]
+    half: list[float]
+    color: np.ndarray
+    lean_rad: float  # forward
+    roll_rad: float
+
+
+class _Limb(NamedTuple):
+    """A piece of a figure between two points, thicker at `high`."""
+
+    low: np.ndarray
+    high: np.ndarray
+    radius: float
+    color: np.ndarray
+
+
 @dataclass
 class _Body:
-    """The pieces of a figure in the person's own axes: x forward, y left, z up, feet at 0; metres and radians."""
+    """The pieces of a figure."""
 
-    solids: list[tuple] = field(default_factory=list)  # (shape, center, half, color, pitch, roll)
-    limbs: list[tuple] = field(default_factory=list)  # (low, high, radius, color)
+    solids: list[_Solid] = field(default_factory=list)
+    limbs: list[_Limb] = field(default_factory=list)
 
     def solid(
-        self, shape: str, center: list[float], half: list[float], color: np.ndarray, pitch_rad: float = 0.0,
+        self, shape: str, center: list[float], half: list[float], color: np.ndarray, lean_rad: float = 0.0,
         roll_rad: float = 0.0,
     ) -> None:  # fmt: skip
-        self.solids.append((shape, center, half, color, -pitch_rad, roll_rad))
+        self.solids.append(_Solid(shape, center, half, color, lean_rad, roll_rad))
 
     def limb(self, low: np.ndarray, high: np.ndarray, radius: float, color: np.ndarray) -> None:
-        """Add a limb between two points, thicker at `high`."""
-        self.limbs.append((low, high, radius, color))
+        self.limbs.append(_Limb(low, high, radius, color))
 
     def placed(self, feet_m: np.ndarray, heading_rad: float, size: float) -> PersonFigure:
         """Return the figure at a place. It turns all pieces at once, which is four times as fast as one by one."""
-        shapes, centers, half, colors, pitch, roll = zip(*self.solids, strict=True)
-        turns = rotation_matrices(np.column_stack([pitch, np.zeros(len(pitch)), roll]))
+        shapes, centers, half, colors, lean, roll = zip(*self.solids, strict=True)
+        # A positive pitch raises the x axis, so it leans backwards.
+        turns = rotation_matrices(np.column_stack([-np.array(lean), np.zeros(len(lean)), roll]))
         limb_lows, limb_highs, limb_radii, limb_colors = (np.array(column) for column in zip(*self.limbs, strict=True))
         lengths = np.linalg.norm(limb_highs - limb_lows, axis=1)
+        # Axes of a limb: z along it, x across it in the person's plane of forward and up.
         z = (limb_highs - limb_lows) / lengths[:, None]
         x = np.stack([z[:, 2], 0.0 * lengths, -z[:, 0]], axis=1) / np.hypot(z[:, 0], z[:, 2])[:, None]
         limb_turns = np.stack([x, np.cross(z, x), z], axis=2)
@@ -267,7 +304,7 @@ def _leg(body: _Body, side: float, phase: float, swing: float, clothes: Clothes)
     body.limb(ankle - [0, 0, 0.02], knee, 0.066, cloth if legs == "trousers" else clothes.skin)
     toe = 0.5 * (angle - bend)
     center = ankle + np.array([0.048 * np.cos(toe), 0.0, -0.043 + 0.048 * np.sin(toe)])
-    body.solid("rounded", center.tolist(), [0.115, 0.048, 0.042], clothes.shoes, pitch_rad=-toe)
+    body.solid("rounded", center.tolist(), [0.115, 0.048, 0.042], clothes.shoes, lean_rad=-toe)
     return ankle
 
 
@@ -287,14 +324,14 @@ def _trunk(body: _Body, breadth: float, swing: float, clothes: Clothes) -> None:
     top = clothes.color("top")
     covered = top if clothes.looks.top in HEMS else clothes.color("legs")
     body.solid("rounded", [0.0, 0.0, 0.95], [0.115, 0.165, 0.12], covered)
-    body.solid("limb", [0.01, 0.0, 1.22], [0.125, 0.195 * breadth, 0.29], top, pitch_rad=lean)
-    body.solid("ball", [0.015, 0.0, 1.42], [0.10, 0.205 * breadth, 0.085], top, pitch_rad=lean)
+    body.solid("limb", [0.01, 0.0, 1.22], [0.125, 0.195 * breadth, 0.29], top, lean_rad=lean)
+    body.solid("ball", [0.015, 0.0, 1.42], [0.10, 0.205 * breadth, 0.085], top, lean_rad=lean)
     for slot in ("top", "legs"):
-        if (garment := getattr(clothes.looks, slot)) in HEMS:
-            low, high, ahead, aside = HEMS[garment]
-            center = [0.0, 0.0, (low + high) / 2.0]
-            half = [ahead, aside, (high - low) / 2.0]
-            body.solid("limb", center, half, clothes.color(slot), pitch_rad=np.pi)
+        hem = HEMS.get(getattr(clothes.looks, slot))
+        if hem is not None:
+            center = [0.0, 0.0, (hem.low + hem.high) / 2.0]
+            half = [hem.ahead, hem.aside, (hem.high - hem.low) / 2.0]
+            body.solid("limb", center, half, clothes.color(slot), lean_rad=np.pi)  # wider at its lower end
 
 
 def _head(body: _Body, clothes: Clothes) -> None:
@@ -311,7 +348,7 @@ def _head(body: _Body, clothes: Clothes) -> None:
         color = clothes.color("hat")
         body.solid("ball", [0.01, 0.0, 1.70], [0.118, 0.102, 0.10], color)
         if hat == "cap":
-            body.solid("rounded", [0.14, 0.0, 1.70], [0.085, 0.075, 0.012], color, pitch_rad=0.15)
+            body.solid("rounded", [0.14, 0.0, 1.70], [0.085, 0.075, 0.012], color, lean_rad=0.15)
         else:
             body.solid("disc", [0.01, 0.0, 1.69], [0.235, 0.225, 0.012], color)
 

@@ -83,8 +83,10 @@ class Poses:
 
     def copy_frame(self, i: int, source: Poses) -> None:
         """Copy frame i from other poses, in place."""
-        for values, source_values in zip(vars(self).values(), vars(source).values(), strict=True):
-            values[i] = source_values[i]
+        self.positions_m[i] = source.positions_m[i]
+        self.rotations_deg[i] = source.rotations_deg[i]
+        self.targets_m[i] = source.targets_m[i]
+        self.clearances_m[i] = source.clearances_m[i]
 
 
 @dataclass(frozen=True)
@@ -190,14 +192,14 @@ def _draw_each_frame(num: int, cfg: PerturbationConfig, rng: np.random.Generator
     """Draw the events and offsets of each frame alone, as in the paper."""
     roll_rng = rng.spawn(1)[0]  # its own generator: the other draws are those of the paper's track, which has no roll
     is_drawn = {event: np.zeros(num, dtype=bool) for event in EVENTS}
-    offsets = np.empty((3, num, 3))
+    person_m, drone_m, view_m = np.empty((3, num, 3))
     for i in range(num):
         events = rng.random(2) < [cfg.position_probability, cfg.rotation_probability]
         is_drawn["position"][i], is_drawn["rotation"][i] = events
-        offsets[0, i] = _offset(rng, cfg, cfg.pedestrian_radius_m, 2)
-        offsets[1, i] = _offset(rng, cfg, cfg.drone_radius_m, 3)
-        offsets[2, i] = _offset(rng, cfg, cfg.view_radius_m, 3)
-    return _Draws(is_drawn, offsets[0], offsets[1], offsets[2], roll_rng.uniform(-1.0, 1.0, num))
+        person_m[i] = _offset(rng, cfg, cfg.pedestrian_radius_m, 2)
+        drone_m[i] = _offset(rng, cfg, cfg.drone_radius_m, 3)
+        view_m[i] = _offset(rng, cfg, cfg.view_radius_m, 3)
+    return _Draws(is_drawn, person_m, drone_m, view_m, roll_rng.uniform(-1.0, 1.0, num))
 
 
 def _offset(rng: np.random.Generator, cfg: PerturbationConfig, radius_m: float, num_axes: int) -> np.ndarray:
@@ -255,14 +257,12 @@ def _apply_smoothly(drawn: _Draws, scene: _Scene, dt_s: float) -> PerturbedTrack
     obstacles = scene.surroundings.obstacles
     planned_degps = _yaw_rates_degps(scene.planned, dt_s)
     is_seen = visibility(obstacles, scene.planned.positions_m, scene.planned.targets_m) >= SEEN_LEAST
-    fallbacks: dict[str, dict[int, str]] = {event: {} for event in EVENTS}  # by frame
+    fallbacks: dict[str, dict[int, str]] = {event: {} for event in EVENTS}  # event -> frame -> reason
     while True:
         active = {event: is_drawn.copy() for event, is_drawn in drawn.is_drawn.items()}
         for event, reasons in fallbacks.items():
             active[event][list(reasons)] = False
-        shift_fade, turn_fade = (_fade(active[event], scene.cfg.correlation_s / dt_s) for event in EVENTS)
-        person_m, drone_m, view_m = drawn.person_m * shift_fade, drawn.drone_m * shift_fade, drawn.view_m * turn_fade
-        track = _apply(_Draws(active, person_m, drone_m, view_m, drawn.roll * turn_fade[:, 0]), scene)
+        track = _apply(_faded(drawn, active, scene.cfg.correlation_s / dt_s), scene)
         hides = is_seen & (visibility(obstacles, track.poses.positions_m, track.poses.targets_m) < SEEN_LEAST)
         is_fast = _yaw_rates_degps(track.poses, dt_s) > np.maximum(planned_degps, YAW_RATE_MAX_DEGPS)
         is_settled = True
@@ -291,6 +291,13 @@ def _yaw_rates_degps(poses: Poses, dt_s: float) -> np.ndarray:
     return np.maximum(np.append(rates, 0.0), np.insert(rates, 0, 0.0))
 
 
+def _faded(drawn: _Draws, active: dict[str, np.ndarray], fade_frames: float) -> _Draws:
+    """Return only the active events, with offsets that fade to zero towards frames without them."""
+    shift_fade, turn_fade = (_fade(active[event], fade_frames) for event in EVENTS)
+    person_m, drone_m = drawn.person_m * shift_fade, drawn.drone_m * shift_fade
+    return _Draws(active, person_m, drone_m, drawn.view_m * turn_fade, drawn.roll * turn_fade[:, 0])
+
+
 def _fade(is_active: np.ndarray, fade_frames: float) -> np.ndarray:
     """Return factors from 0 to 1, (n, 1), that rise from 0 at frames that are not active."""
     frames = np.arange(len(is_active), dtype=np.float64)
@@ -301,8 +308,8 @@ def _fade(is_active: np.ndarray, fade_frames: float) -> np.ndarray:
 def _shift(track: PerturbedTrack, i: int, person_offset: np.ndarray, drone_offset: np.ndarray, scene: _Scene) -> str:
     """Apply the position event of frame i, in place, if all checks pass; return its state. Offsets: (3,) m."""
     planned = scene.planned
-    target = planned.targets_m[i] + person_offset
     feet_z = planned.targets_m[i][2] - TARGET_HEIGHT_M
+    target = planned.targets_m[i] + person_offset
     target[2] = scene.surroundings.surface_z_m(target[0], target[1], feet_z) + TARGET_HEIGHT_M
     drone = planned.positions_m[i] + drone_offset
     # Keep the angle between the camera's axis and the direction to the person.
@@ -315,7 +322,8 @@ def _shift(track: PerturbedTrack, i: int, person_offset: np.ndarray, drone_offse
     ground_z = scene.surroundings.surface_z_m(drone[0], drone[1], feet_z)
     # Where the planner relaxed its safety distance, the plan itself may be nearer than min_clearance_m.
     required_m = min(min_clearance_m, planned.clearances_m[i])
-    if min(drone_distance, scene.bystanders.distance_m(i, drone)) < required_m or drone[2] < ground_z + min_clearance_m:
+    is_near = min(drone_distance, scene.bystanders.distance_m(i, drone)) < required_m
+    if is_near or drone[2] < ground_z + min_clearance_m:
         return DRONE_CLEARANCE
     if min(person_distances) < PERSON_HALF_EXTENTS_M[0] or scene.bystanders.are_in_the_way(i, target):
         return PERSON_IN_OBSTACLE

@@ -1,7 +1,8 @@
 """The second renderer, a slow cross-check of the default one, through trimesh and pyrender (EGL).
 
-It draws plain boxes, trees and figures. Each frame is drawn three times in segmentation mode, for tags, colours and the
-float32 bits of the depth: pyrender's own depth is wrong by centimetres at 30 m.
+It draws plain boxes, trees and figures. pyrender's own depth is wrong by centimetres at 30 m, so each frame is drawn
+three times in segmentation mode with our own shaders: for tags, for colours, and for the float32 bits of the depth. The
+vertex attribute `tangents` holds the tags, because nothing else uses it, and `color_0` the lit colours.
 """
 
 import os
@@ -36,20 +37,26 @@ COLORS = {
 }  # fmt: skip
 
 LIMB_SHARE = (0.85, 0.85, 0.95)  # of its half sizes, that an untapered limb fills
-TAGS, LIT_COLORS, DEPTH_BITS = 255, 128, 0  # what the fragment shader writes, by the red that pyrender passes to it
+LEAST_HALF_M = 1e-3  # half size of a flat box
+# The picture that the fragment shader writes, as the red of the colour that pyrender passes to it.
+TAGS, LIT_COLORS, DEPTH_BITS = 255, 128, 0
 
 
-# k triangles to draw: corners, (k, 3, 3) m relative to the scene's origin, linear RGB, (k, 3), and tags, (k, 4).
-Triangles = tuple[np.ndarray, np.ndarray, np.ndarray]
+class Triangles(NamedTuple):
+    """k triangles to draw."""
+
+    corners_m: np.ndarray  # (k, 3, 3) relative to the scene's origin
+    colors: np.ndarray  # (k, 3) linear RGB
+    tags: np.ndarray  # (k, 4) float, as `_tags` returns them
 
 
-class UnitSolids(NamedTuple):
-    """One solid in each of some boxes, of n in all."""
+class BoxSolids(NamedTuple):
+    """The same solid in some of n boxes. Heights are relative to the box: -1 is its bottom, 1 its top."""
 
     mesh: Any  # trimesh, half size 1
-    rows: np.ndarray  # (n,) bool, the boxes that have one
+    is_in_box: np.ndarray  # (n,) bool, which boxes contain the solid
     half_m: np.ndarray  # (n, 3) half sizes
-    lift: np.ndarray  # (n,) of its middle over the box's, in half heights of the box
+    middle: np.ndarray  # (n,) height of its middle
     colors: np.ndarray  # (n, 3) linear RGB
 
 
@@ -114,26 +121,29 @@ class PyrenderRenderer:
         added = [self._scene.add(pyrender.IntrinsicsCamera(*lens, NEAR_M, FAR_M), pose=pose)]
         for instance_id, person in people.items():
             added.append(self._scene.add(self._mesh(_person_triangles(person, instance_id, self._origin))))
-        tags, colors, bits = (self._draw(output) for output in (TAGS, LIT_COLORS, DEPTH_BITS))
+        frame = self._frame(self._draw(TAGS), self._draw(LIT_COLORS), self._draw(DEPTH_BITS))
         for node in added:
             self._scene.remove_node(node)
-        return self._frame(tags, colors, bits)
+        return frame
 
     def close(self) -> None:
         self._screen.delete()
 
-    def _draw(self, output: int) -> np.ndarray:
-        """Draw one picture of the scene, (h, w, 4) uint8, of TAGS, LIT_COLORS or DEPTH_BITS."""
+    def _draw(self, red: int) -> np.ndarray:
+        """Draw one picture of the scene, (h, w, 4) uint8; red: TAGS, LIT_COLORS or DEPTH_BITS."""
         from pyrender import RenderFlags
 
-        nodes = dict.fromkeys(self._scene.mesh_nodes, (output, 0, 0))
-        image, _ = self._screen.render(self._scene, RenderFlags.SEG | RenderFlags.RGBA, nodes)
+        color_of_node = dict.fromkeys(self._scene.mesh_nodes, (red, 0, 0))
+        image, _ = self._screen.render(self._scene, RenderFlags.SEG | RenderFlags.RGBA, color_of_node)
         return np.ascontiguousarray(image)
 
     def _frame(self, tags: np.ndarray, colors: np.ndarray, bits: np.ndarray) -> Frame:
-        """Return the frame of the three pictures, (h, w, 4) uint8.
+        """Return the frame of three pictures, (h, w, 4) uint8 each.
 
-        tags: kind, low byte of the instance id, high byte, and whether it is sky. bits: one float32 of depth, m.
+        Args:
+            tags: kind, low byte of the instance id, high byte, and whether the pixel is sky.
+            colors: RGB and an unused byte.
+            bits: the bytes of one float32, the depth in m.
         """
         is_sky = tags[..., 3] > 0
         depth = np.where(is_sky, np.float32(SKY_DEPTH_M), bits.view("<f4")[..., 0])
@@ -148,15 +158,15 @@ class PyrenderRenderer:
         """Make a mesh of triangles, lit by the sun."""
         import pyrender
 
-        corners_m, colors, tags = triangles
-        normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+        first, second, third = np.moveaxis(triangles.corners_m, 1, 0)
+        normals = np.cross(second - first, third - first)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         sun = np.maximum(normals @ self._look.sun_direction(), 0.0)[:, None]
         light = AMBIENT + (1.0 - AMBIENT) * sun
-        lit = _as_byte(colors * light * SUNLIT_GAIN * self._look.exposure) / 255.0
+        lit = _as_byte(triangles.colors * light * SUNLIT_GAIN * self._look.exposure) / 255.0
         opaque = np.column_stack([lit, np.ones(len(lit))])
-        attributes = {"tangents": np.repeat(tags, 3, axis=0), "color_0": np.repeat(opaque, 3, axis=0)}
-        return pyrender.Mesh([pyrender.Primitive(corners_m.reshape(-1, 3), **attributes)])
+        attributes = {"tangents": np.repeat(triangles.tags, 3, axis=0), "color_0": np.repeat(opaque, 3, axis=0)}
+        return pyrender.Mesh([pyrender.Primitive(triangles.corners_m.reshape(-1, 3), **attributes)])
 
 
 def _as_byte(linear: np.ndarray) -> np.ndarray:
@@ -170,13 +180,18 @@ def _tags(kinds: np.ndarray, ids: np.ndarray, layers: np.ndarray) -> np.ndarray:
     return np.column_stack([kinds, ids & 255, ids >> 8, contract.LAYER_STEP * layers]).astype(np.float32)
 
 
-def _map_triangles(box_map: BoxMap, origin: np.ndarray, num_others: int) -> Triangles:
-    """Return the triangles of every box and solid of a map, and of its ground plane."""
+def _unit_box() -> Any:
+    """Return a box of half size 1, as a trimesh."""
     import trimesh
 
+    return trimesh.creation.box(extents=(2.0, 2.0, 2.0))
+
+
+def _map_triangles(box_map: BoxMap, origin: np.ndarray, num_others: int) -> Triangles:
+    """Return the triangles of a map and of its ground plane, which is the last row of the arrays of boxes here."""
     plane_center, plane_half = contract.ground_plane(box_map)
     centers = np.vstack([box_map.centers, plane_center]) - origin
-    halves = np.maximum(np.vstack([box_map.half_extents, plane_half]), 1e-3)
+    halves = np.maximum(np.vstack([box_map.half_extents, plane_half]), LEAST_HALF_M)
     turns = rotation_matrices(np.radians(np.vstack([box_map.rotations_deg, np.zeros(3)])))
     kinds = np.append(box_map.kinds, KINDS["Terrain"])
     colors_by_kind = np.tile(PLAIN_COLOR, (256, 1))
@@ -185,50 +200,53 @@ def _map_triangles(box_map: BoxMap, origin: np.ndarray, num_others: int) -> Tria
     ids = np.append(contract.instance_ids(box_map, num_others), np.uint16(NO_INSTANCE))
     tags = _tags(kinds, ids, np.append(layers_of(box_map), 0))
     crowns, stems = _trees(box_map, centers, halves, colors)
-    is_box = np.append(~are_solids(box_map), True)
-    is_plain = ~crowns.rows
-    box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
+    whole_boxes = BoxSolids(_unit_box(), ~crowns.is_in_box, halves, np.zeros(len(kinds)), colors)
+    has_mesh = np.append(are_solids(box_map), False)  # the mesh is drawn instead of the box
     pieces = []
-    for solid in (UnitSolids(box, is_plain, halves, np.zeros(len(kinds)), colors), crowns, stems):
-        rows = solid.rows & is_box
-        middles = centers[rows] + turns[rows, :, 2] * (solid.lift * halves[:, 2])[rows, None]
-        vertices = solid.half_m[rows, None] * solid.mesh.vertices
+    for solid in (whole_boxes, crowns, stems):
+        rows = np.flatnonzero(solid.is_in_box & ~has_mesh)
+        middles = centers[rows] + turns[rows, :, 2] * (solid.middle * halves[:, 2])[rows, None]
+        vertices = solid.half_m[rows, None] * solid.mesh.vertices  # in the axes of the box
         corners = np.einsum("nij,nvj->nvi", turns[rows], vertices) + middles[:, None]
-        repeated = (np.repeat(values[rows], len(solid.mesh.faces), axis=0) for values in (solid.colors, tags))
-        pieces.append((corners[:, solid.mesh.faces].reshape(-1, 3, 3), *repeated))
+        rows_of_faces = np.repeat(rows, len(solid.mesh.faces))
+        faces = corners[:, solid.mesh.faces].reshape(-1, 3, 3)
+        pieces.append(Triangles(faces, solid.colors[rows_of_faces], tags[rows_of_faces]))
     placed = solids_of(box_map)
-    for sides in (placed.corners_m, placed.corners_m[:, ::-1]):  # seen from both
-        pieces.append((sides - origin, colors[placed.rows], tags[placed.rows]))
-    corners_m, colors, tags = map(np.concatenate, zip(*pieces, strict=True))
-    return corners_m, colors, tags
+    for corners_m in (placed.corners_m, placed.corners_m[:, ::-1]):  # both sides are visible
+        pieces.append(Triangles(corners_m - origin, colors[placed.rows], tags[placed.rows]))
+    return Triangles(*map(np.concatenate, zip(*pieces, strict=True)))
 
 
-def _trees(
-    box_map: BoxMap, centers: np.ndarray, halves: np.ndarray, colors: np.ndarray
-) -> tuple[UnitSolids, UnitSolids]:
+def _trees(box_map: BoxMap, centers: np.ndarray, halves: np.ndarray, colors: np.ndarray) -> tuple[BoxSolids, BoxSolids]:
     """Return the crowns of trees and bushes, which replace their boxes, and the stems of the trees.
 
-    centers, halves, colors: (n, 3) of the map's boxes and its ground plane.
+    A crown ends at the top of its box. A stem reaches from the bottom of the box to the middle of the crown.
+
+    Args:
+        centers, halves, colors: (n, 3) of the map's boxes and its ground plane.
     """
     import trimesh
 
     is_round = np.zeros(len(halves), dtype=bool)
-    # In half heights over the middle of the box: -1 without a stem. The crown ends at the top of the box, 1.
-    crown_bottom = np.full(len(halves), -1.0)
+    crown_bottom = np.full(len(halves), -1.0)  # at the bottom of the box, so without a stem
     plants = np.flatnonzero(box_map.kinds == KINDS["Vegetation"])
     seeds = contract.seeds_of(box_map.ids[plants])
     forms, crown_bottom[plants] = contract.plants_of(centers[plants], halves[plants], seeds)
     is_round[plants] = forms >= contract.BUSH
-    crown_middle = (1.0 + crown_bottom) / 2.0
-    crowns_m = halves * np.column_stack([np.ones((len(halves), 2)), (1.0 - crown_bottom) / 2.0])
+    crown_middle, crown_half = _span(crown_bottom, 1.0)
+    crowns_m = halves * np.column_stack([np.ones((len(halves), 2)), crown_half])
+    stem_middle, stem_half = _span(-1.0, crown_middle)
     radius_m = contract.stem_radius_m(halves)
-    stems_m = np.column_stack([radius_m, radius_m, halves[:, 2] * (1.0 + crown_middle) / 2.0])
+    stems_m = np.column_stack([radius_m, radius_m, halves[:, 2] * stem_half])
     ball = trimesh.creation.icosphere(subdivisions=1)
-    box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
     bark = np.tile(STEM_COLOR, (len(halves), 1))
-    crowns = UnitSolids(ball, is_round, crowns_m, crown_middle, colors)
-    # A stem reaches from the bottom of the box, -1, to the middle of the crown.
-    return crowns, UnitSolids(box, crown_bottom > -1.0, stems_m, (crown_middle - 1.0) / 2.0, bark)
+    crowns = BoxSolids(ball, is_round, crowns_m, crown_middle, colors)
+    return crowns, BoxSolids(_unit_box(), crown_bottom > -1.0, stems_m, stem_middle, bark)
+
+
+def _span(bottom: np.ndarray | float, top: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the middle and the half length of the spans between two heights, (n,) each."""
+    return np.asarray(bottom + top) / 2.0, np.asarray(top - bottom) / 2.0
 
 
 def _person_triangles(person: PosedPerson, instance_id: int, origin: np.ndarray) -> Triangles:
@@ -236,13 +254,12 @@ def _person_triangles(person: PosedPerson, instance_id: int, origin: np.ndarray)
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=2)
-    box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
     rod = trimesh.creation.cylinder(1.0, 2.0, sections=12).triangles
-    units = {"ball": ball.triangles, "rounded": box.triangles, "disc": rod, "limb": rod * LIMB_SHARE}
+    units = {"ball": ball.triangles, "rounded": _unit_box().triangles, "disc": rod, "limb": rod * LIMB_SHARE}
     figure = figure_of(person)
     solids = zip(figure.shapes, figure.centers_m, figure.turns, figure.half_m, strict=True)
     parts = [(units[shape] * half) @ turn.T + center - origin for shape, center, turn, half in solids]
     corners_m = np.concatenate(parts)
     colors = np.repeat(figure.colors, [len(part) for part in parts], axis=0)
-    kinds, ids, layers = (np.array([tag]) for tag in (KINDS["Pedestrians"], instance_id, contract.STANDING_LAYER))
-    return corners_m, colors, np.repeat(_tags(kinds, ids, layers), len(corners_m), axis=0)
+    tag = _tags(*np.array([[KINDS["Pedestrians"]], [instance_id], [contract.STANDING_LAYER]]))
+    return Triangles(corners_m, colors, np.repeat(tag, len(corners_m), axis=0))

@@ -2,7 +2,7 @@
 
 import logging
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -38,7 +38,10 @@ class NoPictureError(Exception):
 
 
 class SimulatorRenderer(ABC):
-    """A renderer that asks a server for each frame; each worker has a server of its own."""
+    """A renderer that asks a server for each frame; each worker has a server of its own.
+
+    It calls `_open` once, `_frame` for each frame, and `_recover` before it tries to draw a failed frame again.
+    """
 
     dresses = False  # people wear what their blueprint wears
     engine: ClassVar[str]
@@ -73,15 +76,7 @@ class SimulatorRenderer(ABC):
     def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, people: PosedPeople) -> Frame:
         """Draw one frame, as the contract says; one that fails is drawn again after `_recover`."""
         check_pose(camera_pose, intrinsic)
-        width, height = self._size_px
-        fov_deg = round(Camera(width, height, intrinsic).fov_deg, 6)  # all that a simulator knows of a lens
-        f = focal_px(width, fov_deg)
-        if not np.allclose(intrinsic, [[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]], atol=1e-3):
-            what = "the simulator cannot render with this intrinsic matrix of the camera"
-            (fx, skew, cx), (_, fy, cy) = intrinsic[:2]
-            got = f"fx {fx:g}, fy {fy:g}, skew {skew:g}, principal point {cx:g}, {cy:g} px"
-            expected = "square pixels, and the principal point in the middle of the picture"
-            raise RenderError(what, where=self.device, got=got, expected=expected)
+        fov_deg = self._fov_deg_of(intrinsic)
         problem: Exception | None = None
         for attempt in range(1, TRIES + 1):
             try:
@@ -98,14 +93,32 @@ class SimulatorRenderer(ABC):
             raise RenderError("a camera of the simulator sent no picture", where=self.device, got=str(problem), fix=FIX)
         raise EnvironmentMissing("the simulator no longer answers", where=self.device, got=str(problem), fix=FIX)
 
+    def _fov_deg_of(self, intrinsic: np.ndarray) -> float:
+        """Return the horizontal field of view of a matrix, which is all that a simulator knows of a lens."""
+        width, height = self._size_px
+        fov_deg = round(Camera(width, height, intrinsic).fov_deg, 6)
+        f = focal_px(width, fov_deg)
+        if not np.allclose(intrinsic, [[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]], atol=1e-3):
+            what = "the simulator cannot render with this intrinsic matrix of the camera"
+            (fx, skew, cx), (_, fy, cy) = intrinsic[:2]
+            got = f"fx {fx:g}, fy {fy:g}, skew {skew:g}, principal point {cx:g}, {cy:g} px"
+            expected = "square pixels, and the principal point in the middle of the picture"
+            raise RenderError(what, where=self.device, got=got, expected=expected)
+        return fov_deg
 
-def placement_of(person: PosedPerson, lead_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return where to put a person who reaches the posed place `lead_s` seconds later.
 
-    Returns:
-        Position of the hip, (3,) m; rotation, (3,) degrees; unit vector ahead, (3,); walking speed, m/s.
-    """
-    turn_deg = np.array([0.0, np.degrees(person.heading_rad), 0.0])
+class Placement(NamedTuple):
+    """Where to put a walking person."""
+
+    hip_m: np.ndarray  # (3,) world
+    rotation_deg: np.ndarray  # (3,) pitch, yaw, roll
+    ahead: np.ndarray  # (3,) unit vector
+    speed_mps: float
+
+
+def placement_of(person: PosedPerson, lead_s: float) -> Placement:
+    """Return where to put a person who walks, so that the person reaches the posed place after `lead_s` seconds."""
+    rotation_deg = np.array([0.0, np.degrees(person.heading_rad), 0.0])
     ahead = np.array([np.cos(person.heading_rad), np.sin(person.heading_rad), 0.0])
     speed_mps = WALK_MPS * person.swing
-    return person.hip_m - ahead * speed_mps * lead_s, turn_deg, ahead, speed_mps
+    return Placement(person.hip_m - ahead * speed_mps * lead_s, rotation_deg, ahead, speed_mps)

@@ -6,7 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel
@@ -45,7 +45,6 @@ RENDERERS = {
     "unrealcv": "cosfly.render.unrealcv_backend:UnrealCvRenderer",
 }
 TRAJECTORY = "trajectory_"
-Inputs = tuple[Path, Path, Path, Path | None]  # drawn and simplified map, trajectories, bystanders
 # Names of trajectories are times of ten digits, as those of the public release.
 FIRST_S = 1_000_000_000
 SPAN_S = 999_000_000
@@ -69,8 +68,11 @@ def open_renderer(
 
 
 def renderer_of(cfg: RenderConfig, box_map: BoxMap, num_others: int = 0, like: Renderer | None = None) -> Renderer:
-    """Open the renderer of the settings; like: one of another map with these settings, whose device it shares if it
-    can."""
+    """Open the renderer of the settings.
+
+    Args:
+        like: A renderer of another map with the same settings; if possible, its device is shared.
+    """
     if with_map := getattr(like, "with_map", None):
         return with_map(box_map)
     settings = getattr(cfg, cfg.backend, None)
@@ -80,9 +82,14 @@ def renderer_of(cfg: RenderConfig, box_map: BoxMap, num_others: int = 0, like: R
 # --- scripts of tracks ------------------------------------------------------------------------------------------------
 
 
+def camera_of(cfg: RenderConfig, fov_deg: float) -> Camera:
+    """Return the camera of the settings with a horizontal field of view."""
+    return Camera(cfg.width_px, cfg.height_px, intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg))
+
+
 def make_track_script(
     planned: DroneTrace,
-    number: int,
+    path_index: int,
     track: str,
     town: str,
     surroundings: Surroundings,
@@ -94,49 +101,58 @@ def make_track_script(
     """Choose all that one track shows. Both tracks of a trajectory share field of view, people and weather.
 
     Args:
-        planned: Every `frame_stride`-th of its poses is drawn. others: At the same times.
+        planned: Every `frame_stride`-th of its poses is drawn.
+        others: The bystanders, at the times of `planned`.
     """
     assert cfg.first_timestamp is not None, "`run` sets it"
     trace = planned.every(cfg.frame_stride)
-    looks = planned.drawn_as(number)
-    before_m = looks.before_m[:-1]
-    step = step_s(planned.time_s)
-    before_s = trace.time_s[0] - step * np.arange(len(before_m), 0, -1)
+    excerpt = planned.drawn_as(path_index)
+    # The gait begins with the whole trajectory that `planned` is a part of, so that its frames look the same.
+    before_m = excerpt.before_m[:-1]
+    before_s = trace.time_s[0] - step_s(planned.time_s) * np.arange(len(before_m), 0, -1)
     gait = gait_of(np.vstack([before_m, trace.targets_m]), np.concatenate([before_s, trace.time_s]))
-    items = (f"{looks.path_id}{part}" for part in ("", "/others", "/zoom"))
-    shared, others_rng, zoom_rng = (rng_for(seed, "render", item) for item in items)
-    fov_deg = float(cfg.fovs_deg[int(shared.integers(len(cfg.fovs_deg)))])
-    clothes = choose_clothes(shared)
+    shared_rng = rng_for(seed, "render", excerpt.path_id)
+    fov_deg = float(cfg.fovs_deg[int(shared_rng.integers(len(cfg.fovs_deg)))])
+    clothes = choose_clothes(shared_rng)
     drawn_others = [other.every(cfg.frame_stride) for other in others]
-    cast = dress_bystanders(drawn_others, trace.time_s, clothes.looks, others_rng)
-    size_px = cfg.width_px, cfg.height_px
-    fovs_deg = [fov_deg]
+    others_rng = rng_for(seed, "render", f"{excerpt.path_id}/others")
+    bystanders = dress_bystanders(drawn_others, trace.time_s, clothes.looks, others_rng)
+    cameras = (camera_of(cfg, fov_deg),) * len(trace.time_s)
     if cfg.zoom.mode == "dynamic":
-        fovs_deg = zoomed_deg(fov_deg, cfg.fovs_deg, cfg.zoom, trace.time_s, trace.segments, zoom_rng).tolist()
-    cameras = tuple(Camera(*size_px, intrinsic_matrix(*size_px, fov_deg)) for fov_deg in fovs_deg)
-    cameras = cameras if cfg.zoom.mode == "dynamic" else cameras * len(trace.time_s)
+        zoom_rng = rng_for(seed, "render", f"{excerpt.path_id}/zoom")
+        fovs_deg = zoomed_deg(fov_deg, cfg.fovs_deg, cfg.zoom, trace.time_s, trace.segments, zoom_rng)
+        cameras = tuple(camera_of(cfg, fov_deg) for fov_deg in fovs_deg.tolist())
     poses = Poses(trace.positions_m, trace.rotations_deg, trace.targets_m, trace.clearances_m)
     perturbed = PerturbedTrack.unperturbed(poses)
     if track == "perturbed":
         rng = rng_for(seed, "render", f"{trace.path_id}/{PERTURBED}")
-        perturbed = perturb(poses, cameras, surroundings, cfg.perturbation, rng, cast, step_s(trace.time_s))
+        perturbed = perturb(poses, cameras, surroundings, cfg.perturbation, rng, bystanders, step_s(trace.time_s))
     return TrackScript(
         town=town,
-        trajectory=f"{TRAJECTORY}{cfg.first_timestamp + number}",
+        trajectory=f"{TRAJECTORY}{cfg.first_timestamp + path_index}",
         variant=VARIANTS[track],
-        number=number,
+        path_index=path_index,
         trace=trace,
         cameras=cameras,
         perturbed=perturbed,
         gait=gait.since(len(before_m)),
         clothes=clothes,
-        bystanders=cast,
+        bystanders=bystanders,
         look=cfg.look if weather is None else None,
         weather=weather,
     )
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
+
+
+class RenderInputs(NamedTuple):
+    """The files that a worker reads."""
+
+    boxes: Path  # drawn map
+    simplified: Path  # map for clearances
+    traces: Path
+    others: Path | None
 
 
 def run(
@@ -152,29 +168,22 @@ def run(
     others: Path | None = None,
 ) -> Path:
     """Read the maps `boxes_3d.json` (drawn) and `step2_simplified.json` (clearance), `drone_trace.json` and, with
-    bystanders, `others.json`; writes the playback tree.
+    bystanders, `others.json`; write the playback tree.
 
-    Trajectories that the planner dropped are not drawn; the manifest counts them. Returns the tree's root, `out`.
+    Trajectories that the planner dropped are not drawn; the manifest counts them. Return the tree's root, `out`.
     """
-    inputs = {"boxes": boxes, "simplified": simplified, "traces": traces} | ({"others": others} if others else {})
-    read_pools(cfg)  # checked before anything is written
-    inputs |= cfg.pool_files()
-    checked_inputs(inputs)  # before the map is read for the names of its meshes, which are inputs too
-    box_map = read_boxes(boxes)
-    inputs |= {f"mesh {name}": path for name, path in box_map.meshes.files().items()}
-    if cfg.path_index is not None and cfg.path_index >= (num := len(read_traces(traces))):
-        problem = "the input has no drone trajectory with this index"
-        expected = f"an index from 0 to {num - 1}"
-        raise ConfigError(problem, where="render.path_index", got=cfg.path_index, expected=expected)
+    files = RenderInputs(boxes, simplified, traces, others)
+    box_map, inputs = _checked_inputs(cfg, files)
     stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed)
     if stage.is_complete:
         return out
     check_ground(box_map, boxes)
-    all_traces = read_traces(traces)
-    if twice := [path_id for path_id, n in Counter(trace.path_id for trace in all_traces).items() if n > 1]:
-        fix = "run the plan stage again"
-        raise InputError("two drone trajectories have the same id", where=traces, got=min(twice), fix=fix)
-    passed = {n: t for n, t in enumerate(all_traces) if t.drop_reason is None and cfg.path_index in (None, n)}
+    all_traces = _read_distinct_traces(traces)
+    passed = {
+        path_index: trace
+        for path_index, trace in enumerate(all_traces)
+        if trace.drop_reason is None and cfg.path_index in (None, path_index)
+    }
     if not passed:
         tally = Tally(input=len(all_traces), dropped=Counter(str(trace.drop_reason) for trace in all_traces))
         raise stage.nothing_kept(tally, expected="at least one trajectory that the planner accepted")
@@ -182,27 +191,17 @@ def run(
     ids = instance_ids(box_map, num_others)
     if num_shared := int((ids == SHARED_ID).sum()):
         log.warning("render: %d boxes share the instance id %d, because ids have 16 bits", num_shared, SHARED_ID)
-    town, updates = _names(stage, cfg, box_map.name, traces, others, seed)
+    town, updates = _names(stage, cfg, box_map.name, files, seed)
     cfg = cfg.model_copy(update=updates)
     items = [
-        Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track), len(trace.time_s[:: cfg.frame_stride]))
-        for number, trace in passed.items()
+        Item(f"{trace.path_id}/{VARIANTS[track]}", (path_index, track), len(trace.time_s[:: cfg.frame_stride]))
+        for path_index, trace in passed.items()
         for track in cfg.tracks
     ]
-    arguments = (cfg, (boxes, simplified, traces, others), out, town, seed, min(workers, len(items)))
+    arguments = (cfg, files, out, town, seed, min(workers, len(items)))
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="render: frames")
-    ids_file = out / town / IDS_FILE
+    ids_file = _write_ids(out / town, box_map, ids, num_others)
     map_file = write_town_map(out / town, box_map.header)
-    ids_record = {
-        **IDS_FORMAT.header,
-        "person": PERSON_ID,
-        "shared": SHARED_ID,
-        **({"others": [other_id(number) for number in range(num_others)]} if num_others else {}),
-        "num_shared": num_shared,
-        "are_box_ids": has_own_ids(box_map, num_others),
-        "boxes": [[a, b] for a, b in zip(ids.tolist(), box_map.ids.tolist(), strict=True) if a != SHARED_ID],
-    }
-    write_json(ids_file, ids_record, indent=None)
     rendered = [result_of(record, _RenderedTrack) for record in finished.kept]
     outputs = [inside(out, track.folder) / name for track in rendered for name in ("trajectory.json", CHECKSUMS)]
     stage.finish(
@@ -219,6 +218,48 @@ def run(
     return out
 
 
+def _checked_inputs(cfg: RenderConfig, files: RenderInputs) -> tuple[BoxMap, dict[str, Path]]:
+    """Check settings and inputs before anything is written; return the drawn map and the paths of all inputs."""
+    inputs = {"boxes": files.boxes, "simplified": files.simplified, "traces": files.traces}
+    if files.others is not None:
+        inputs["others"] = files.others
+    read_pools(cfg)
+    inputs |= cfg.pool_files()
+    checked_inputs(inputs)  # before the map is read for the names of its meshes, which are inputs too
+    box_map = read_boxes(files.boxes)
+    inputs |= {f"mesh {name}": path for name, path in box_map.meshes.files().items()}
+    if cfg.path_index is not None and cfg.path_index >= (num := len(read_traces(files.traces))):
+        problem = "the input has no drone trajectory with this index"
+        expected = f"an index from 0 to {num - 1}"
+        raise ConfigError(problem, where="render.path_index", got=cfg.path_index, expected=expected)
+    return box_map, inputs
+
+
+def _read_distinct_traces(path: Path) -> list[DroneTrace]:
+    """Read the drone trajectories; raise InputError if two have the same id."""
+    traces = read_traces(path)
+    if twice := [path_id for path_id, num in Counter(trace.path_id for trace in traces).items() if num > 1]:
+        fix = "run the plan stage again"
+        raise InputError("two drone trajectories have the same id", where=path, got=min(twice), fix=fix)
+    return traces
+
+
+def _write_ids(folder: Path, box_map: BoxMap, ids: np.ndarray, num_others: int) -> Path:
+    """Write which instance ids the people and the boxes of a map have; ids: (n,) of the boxes."""
+    path = folder / IDS_FILE
+    record = {
+        **IDS_FORMAT.header,
+        "person": PERSON_ID,
+        "shared": SHARED_ID,
+        **({"others": [other_id(number) for number in range(num_others)]} if num_others else {}),
+        "num_shared": int((ids == SHARED_ID).sum()),
+        "are_box_ids": has_own_ids(box_map, num_others),
+        "boxes": [[a, b] for a, b in zip(ids.tolist(), box_map.ids.tolist(), strict=True) if a != SHARED_ID],
+    }
+    write_json(path, record, indent=None)
+    return path
+
+
 class _RenderedTrack(BaseModel):
     """The values of a rendered track in the journal that are read again."""
 
@@ -229,27 +270,28 @@ class _RenderedTrack(BaseModel):
 
 
 def bystanders_of(others: Path | None, traces: list[DroneTrace]) -> tuple[dict[str, list[Bystander]], int]:
-    """Read the bystanders of every trajectory, by path id, and how many ids they need: as many as one has at most."""
+    """Read the bystanders of every trajectory, by path id, and the greatest number of bystanders of one trajectory."""
     if others is None:
         return {}, 0
-    by_path = {path.path_id: path.others for path in read_bystanders(others)}
+    bystanders = {path.path_id: path.others for path in read_bystanders(others)}
     for trace in traces:
         where = f"{others}: {trace.path_id}"
-        if trace.path_id not in by_path:
+        if trace.path_id not in bystanders:
             raise InputError("the file has no bystanders for the drone trajectory", where=where, fix=FROM_ONE_RUN)
-        if other_lengths := {len(other.positions_m) for other in by_path[trace.path_id]} - {len(trace.time_s)}:
-            raise InputError(
-                "a bystander has more or fewer positions than the drone trajectory",
-                where=where,
-                got=f"{other_lengths.pop()} positions",
-                expected=f"{len(trace.time_s)} positions",
-                fix=FROM_ONE_RUN,
-            )
-    return by_path, max(map(len, by_path.values()), default=0)
+        for bystander in bystanders[trace.path_id]:
+            if len(bystander.positions_m) != len(trace.time_s):
+                raise InputError(
+                    "a bystander has more or fewer positions than the drone trajectory",
+                    where=where,
+                    got=f"{len(bystander.positions_m)} positions",
+                    expected=f"{len(trace.time_s)} positions",
+                    fix=FROM_ONE_RUN,
+                )
+    return bystanders, max(map(len, bystanders.values()), default=0)
 
 
 def _names(
-    stage: StageFolder, cfg: RenderConfig, map_name: str, traces: Path, others: Path | None, seed: int
+    stage: StageFolder, cfg: RenderConfig, map_name: str, files: RenderInputs, seed: int
 ) -> tuple[str, dict[str, int]]:
     """Return the town's folder, and the settings that name the first trajectory and seed the weather.
 
@@ -258,42 +300,46 @@ def _names(
     town = town_folder(cfg.town or map_name)
     settings = cfg.recorded()
     del settings["depth_format"]  # poses are the same in either
-    named_by = [town, seed, fingerprint(traces), settings, *([] if others is None else [fingerprint(others)])]
+    named_by = [town, seed, fingerprint(files.traces), settings]
+    if files.others is not None:
+        named_by.append(fingerprint(files.others))
     first = cfg.first_timestamp
     weather_seed = cfg.weather_seed
     if first is None:
         first = FIRST_S + int(sha256_bytes(dump_json(named_by).encode()), 16) % SPAN_S
-    numbers = {trace.path_id: number for number, trace in enumerate(read_traces(traces))}
-    begun = [(numbers.get(item.id.rpartition("/")[0]), item) for item in stage.items() if isinstance(item, Kept)]
-    kept = [(number, result_of(item, _RenderedTrack)) for number, item in begun if number is not None]
-    if kept:
-        place = place_of(Path(kept[0][1].folder))
+    index_of = {trace.path_id: path_index for path_index, trace in enumerate(read_traces(files.traces))}
+    existing = [  # index of the trajectory and track
+        (index_of[path_id], result_of(item, _RenderedTrack))
+        for item in stage.items()
+        if isinstance(item, Kept) and (path_id := item.id.rpartition("/")[0]) in index_of
+    ]
+    if existing:
+        path_index, track = existing[0]
+        place = place_of(Path(track.folder))
         town = place.town
-        first = int(place.trajectory.removeprefix(TRAJECTORY)) - kept[0][0]
+        first = int(place.trajectory.removeprefix(TRAJECTORY)) - path_index
     if weather_seed < 0:
-        weather_seed = next((track.weather_seed for _, track in kept if track.weather_seed), None) or random_seed()
+        weather_seed = next((track.weather_seed for _, track in existing if track.weather_seed), None) or random_seed()
     return town, {"first_timestamp": first, "weather_seed": weather_seed}
 
 
-def make_worker(cfg: RenderConfig, inputs: Inputs, out: Path, town: str, seed: int, num_processes: int) -> Work:
-    """Open a renderer in this process and return the function that draws one (trace, track)."""
-    boxes, simplified, traces, others = inputs
+def make_worker(cfg: RenderConfig, files: RenderInputs, out: Path, town: str, seed: int, num_processes: int) -> Work:
+    """Open a renderer in this process and return the function that draws one track of a trajectory."""
     if num_processes > 1:
         # Processes share the cores: one rasteriser thread each. The driver reads it when it loads.
         os.environ.setdefault("LP_NUM_THREADS", str(max(1, num_cpus() // num_processes)))
-    surroundings = Surroundings(read_boxes(simplified))
-    all_traces = read_traces(traces)
-    bystanders, num_others = bystanders_of(others, all_traces)
-    box_map = read_boxes(boxes)
+    surroundings = Surroundings(read_boxes(files.simplified))
+    all_traces = read_traces(files.traces)
+    bystanders, num_others = bystanders_of(files.others, all_traces)
     weathers = weathers_of(cfg, read_pools(cfg), (trace.drawn_as(n).number for n, trace in enumerate(all_traces)))
-    renderer = renderer_of(cfg, box_map, num_others)
+    renderer = renderer_of(cfg, read_boxes(files.boxes), num_others)
 
     def work(item: Item) -> Outcome:
-        number, track = item.payload
-        trace = all_traces[number]
-        weather = weathers[trace.drawn_as(number).number]
+        path_index, track = item.payload
+        trace = all_traces[path_index]
+        weather = weathers[trace.drawn_as(path_index).number]
         trace_bystanders = bystanders.get(trace.path_id, ())
-        script = make_track_script(trace, number, track, town, surroundings, cfg, seed, trace_bystanders, weather)
+        script = make_track_script(trace, path_index, track, town, surroundings, cfg, seed, trace_bystanders, weather)
         folder = out / town / script.trajectory / script.variant
         with atomic_folder(folder) as unfinished:
             rendered = render_track(renderer, script, unfinished, cfg)

@@ -31,11 +31,13 @@ def layers_of(box_map: BoxMap) -> np.ndarray:
 
 
 def _tiers(box_map: BoxMap, layers: np.ndarray) -> np.ndarray:
-    """Return the tier of each surface, (n,) in [0, 1).
+    """Return the tier of each surface as a fraction, (n,) in [0, 1).
 
-    It is the lowest tier that no earlier surface has which overlaps in the same layer and plane, or else the highest.
+    A surface gets the lowest tier that is free: that no earlier surface has which overlaps with it in the same layer
+    and plane. If none is free, it gets the highest.
     """
-    rows = np.flatnonzero((layers < STANDING_LAYER) & ~box_map.rotations_deg[:, [0, 2]].any(axis=1))
+    is_level = ~box_map.rotations_deg[:, [0, 2]].any(axis=1)
+    rows = np.flatnonzero((layers < STANDING_LAYER) & is_level)
     yaws = np.radians(box_map.rotations_deg[rows, 1])[:, None]
     x, y = np.moveaxis(np.maximum(box_map.half_extents[rows, None, :2] - EDGE_M, 0.0) * CORNERS, 2, 0)
     turned = np.stack([x * np.cos(yaws) - y * np.sin(yaws), x * np.sin(yaws) + y * np.cos(yaws)], axis=2)
@@ -44,12 +46,12 @@ def _tiers(box_map: BoxMap, layers: np.ndarray) -> np.ndarray:
     later, earlier = shapely.STRtree(outlines).query(outlines, predicate="intersects")
     is_same = (earlier < later) & (layers[rows[earlier]] == layers[rows[later]])
     is_same &= np.abs(tops_m[earlier] - tops_m[later]) < SAME_HEIGHT_M
-    overlapped: dict[int, list[int]] = {}
-    for row, other in zip(rows[later[is_same]].tolist(), rows[earlier[is_same]].tolist(), strict=True):
-        overlapped.setdefault(row, []).append(other)
+    earlier_of: dict[int, list[int]] = {}  # row -> rows of earlier surfaces in one plane with it
+    for row, earlier_row in zip(rows[later[is_same]].tolist(), rows[earlier[is_same]].tolist(), strict=True):
+        earlier_of.setdefault(row, []).append(earlier_row)
     tiers = np.zeros(len(box_map), dtype=int)
-    for row in sorted(overlapped):  # in the map's order, so that earlier ones have theirs
-        free = np.setdiff1d(np.arange(MOST_TIERS), tiers[overlapped[row]])
+    for row in sorted(earlier_of):  # in the map's order, so that earlier surfaces have their tiers
+        free = np.setdiff1d(np.arange(MOST_TIERS), tiers[earlier_of[row]])
         tiers[row] = free[0] if len(free) else MOST_TIERS - 1
     return tiers / (tiers.max(initial=0) + 1)
 
@@ -59,15 +61,11 @@ def _tiers(box_map: BoxMap, layers: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Solids:
-    """Triangles of meshes in the world, k of them.
+    """k triangles of placed meshes."""
 
-    corners_m: (k, 3, 3), counter-clockwise from outside. rows: (k,) of the map's boxes. things: (k,) ascending, a
-    number for each placed mesh.
-    """
-
-    corners_m: np.ndarray
-    rows: np.ndarray
-    things: np.ndarray
+    corners_m: np.ndarray  # (k, 3, 3) world, counter-clockwise from outside
+    rows: np.ndarray  # (k,) of the map's boxes
+    objects: np.ndarray  # (k,) ascending, the number of the placed mesh
 
     def __len__(self) -> int:
         return len(self.corners_m)
@@ -88,9 +86,9 @@ def solids_of(box_map: BoxMap) -> Solids:
     """Place the meshes of a map: each in its box, or once in the world for all boxes that name it."""
     corners = [np.zeros((0, 3, 3))]
     rows = []
-    counts = []
+    counts = []  # of triangles
     meshes = box_map.meshes.resolved()
-    placed = set()
+    placed = set()  # meshes in the world
     turns = rotation_matrices(np.radians(box_map.rotations_deg)) if meshes else np.zeros((0, 3, 3))
     for row in np.flatnonzero(are_solids(box_map)):
         ref = box_map.meshes.refs[int(box_map.ids[row])]
@@ -106,5 +104,5 @@ def solids_of(box_map: BoxMap) -> Solids:
             corners.append((mesh - (low + high) / 2.0) * stretch @ turns[row].T + box_map.centers[row])
         rows.append(row)
         counts.append(len(mesh))
-    things = np.repeat(np.arange(len(counts)), counts)
-    return Solids(np.concatenate(corners), np.repeat(np.array(rows, dtype=np.int64), counts), things)
+    objects = np.repeat(np.arange(len(counts)), counts)
+    return Solids(np.concatenate(corners), np.repeat(np.array(rows, dtype=np.int64), counts), objects)

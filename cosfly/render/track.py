@@ -4,7 +4,7 @@ import copy
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,7 +49,7 @@ class TrackScript:
     town: str
     trajectory: str
     variant: str
-    number: int  # index of the trajectory in its file
+    path_index: int  # of the trajectory in its file
     trace: DroneTrace  # its drawn poses
     cameras: tuple[Camera, ...]  # one per frame
     perturbed: PerturbedTrack
@@ -68,12 +68,12 @@ def render_track(renderer: Renderer, script: TrackScript, folder: Path, cfg: Ren
     Returns:
         The track as it was written.
     """
-    script = replace(script, perturbed=copy.deepcopy(script.perturbed))  # `_draw_frames` changes it
     poses = script.perturbed.poses
     places = np.concatenate([poses.positions_m, poses.targets_m])
     weather = None if script.weather is None else script.weather.params
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M, weather)
     drawn = _draw_frames(renderer, script, folder, cfg)
+    script = replace(script, perturbed=drawn.perturbed)
     track = _with_goal(_track(script, drawn), renderer, script, cfg)
     write_track(folder, track)
     file_names = ["trajectory.json"]
@@ -102,20 +102,23 @@ class DrawnFrame(NamedTuple):
     bystanders: BystandersMeta | None  # None: the track has none
 
 
-class DrawnFrames(NamedTuple):
+@dataclass
+class DrawnFrames:
     """What remains in memory of the frames of a track."""
 
-    targets: list[TargetMeta]  # as written
-    visibility: list[float]  # of the targets, not rounded
-    bystanders: list[dict[str, Any]]  # fields of the points of `trajectory.json`
-    digests: dict[str, str]  # file -> sha256
+    perturbed: PerturbedTrack  # without the shifts that hide the target
+    targets: list[TargetMeta] = field(default_factory=list)  # as written
+    visibility: list[float] = field(default_factory=list)  # of the targets, not rounded
+    point_fields: list[dict[str, Any]] = field(default_factory=list)  # bystanders in the points of `trajectory.json`
+    digests: dict[str, str] = field(default_factory=dict)  # file -> sha256
 
 
 def _draw_frames(renderer: Renderer, script: TrackScript, folder: Path, cfg: RenderConfig) -> DrawnFrames:
-    """Draw and write all frames, encoding in threads; drop shifts that hide the target from `script.perturbed`."""
-    perturbed = script.perturbed
+    """Draw and write all frames, encoding in threads; drop the shifts that hide the target."""
+    perturbed = copy.deepcopy(script.perturbed)
+    script = replace(script, perturbed=perturbed)
     people = script.bystanders.people(script.clothes.looks) if renderer.dresses else None
-    drawn = DrawnFrames([], [], [], {})
+    drawn = DrawnFrames(perturbed)
     pending = deque[Future]()
 
     def collect_oldest() -> None:
@@ -125,18 +128,19 @@ def _draw_frames(renderer: Renderer, script: TrackScript, folder: Path, cfg: Ren
 
     with ThreadPoolExecutor(ENCODER_THREADS) as pool:
         for i in range(len(script.trace.time_s)):
-            shown = draw_frame(renderer, script, i, perturbed.poses, cfg.visible_threshold)
-            if perturbed.is_shifted(i) and not shown.target.visible:
+            frame = draw_frame(renderer, script, i, perturbed.poses, cfg.visible_threshold)
+            if perturbed.is_shifted(i) and not frame.target.visible:
                 assert perturbed.unshifted is not None
                 unshifted = draw_frame(renderer, script, i, perturbed.unshifted.poses, cfg.visible_threshold)
                 if unshifted.target.visible:
                     perturbed.drop_shift(i, HIDDEN)
-                    shown = unshifted
-            annotated = shown.bystanders
-            target_m = perturbed.poses.targets_m[i]
-            drawn.visibility.append(shown.target.visibility)
-            drawn.bystanders.append({} if annotated is None else {"others": annotated.people_of(target_m, people)})
-            pending.append(pool.submit(_write_frame, folder, shown.frame, _annotation(script, i, shown), cfg))
+                    frame = unshifted
+            drawn.visibility.append(frame.target.visibility)
+            point_fields = {}
+            if frame.bystanders is not None:
+                point_fields["others"] = frame.bystanders.people_of(perturbed.poses.targets_m[i], people)
+            drawn.point_fields.append(point_fields)
+            pending.append(pool.submit(_write_frame, folder, frame.frame, _annotation(script, i, frame), cfg))
             advance()
             while len(pending) >= FRAMES_AHEAD:
                 collect_oldest()
@@ -155,7 +159,7 @@ def draw_frame(renderer: Renderer, script: TrackScript, i: int, poses: Poses, vi
     frame = renderer.render(pose, camera.intrinsic, {PERSON_ID: target, **bystanders})
     view = view_target(target_m, pose, camera)
     ids = np.array(list(bystanders), dtype=np.int64)
-    score, by_bystanders, by_map = rendered_visibility(frame, target_m, view, pose, camera, ids)
+    visibility = rendered_visibility(frame, target_m, view, pose, camera, ids)
     is_person = frame.ids == PERSON_ID
     num_px = int(np.count_nonzero(is_person))
     target_meta = TargetMeta(
@@ -169,11 +173,11 @@ def draw_frame(renderer: Renderer, script: TrackScript, i: int, poses: Poses, vi
         depth_m=view.depth_m,
         in_view=view.in_view,
         # A thin pole may hide the person and not the box: both depth and mask must show the target.
-        visible=view.in_view and score > visible_threshold and num_px > 0,
-        visibility=score,
+        visible=view.in_view and visibility.score > visible_threshold and num_px > 0,
+        visibility=visibility.score,
         num_pixels=num_px,
     )
-    bystanders_meta = script.bystanders.meta(i, frame, by_bystanders, by_map) if bystanders else None
+    bystanders_meta = script.bystanders.meta(i, frame, visibility) if bystanders else None
     return DrawnFrame(frame, target_meta, bystanders_meta)
 
 
@@ -188,7 +192,7 @@ def written_target(target: TargetMeta, frame: Frame) -> TargetMeta:
 
 
 def _annotation(script: TrackScript, i: int, drawn: DrawnFrame) -> FrameMeta:
-    """Return `meta.json` of frame i, before its target's legibility is known."""
+    """Return `meta.json` of frame i, without the target's legibility, which takes time and is added in a thread."""
     perturbed = script.perturbed
     return FrameMeta(
         index=i,
@@ -239,14 +243,15 @@ def _track(script: TrackScript, drawn: DrawnFrames) -> Track:
     zooms = any(camera is not cameras[0] for camera in cameras)
 
     def column(name: str, num: int = 1) -> np.ndarray:
+        """Return a field of `num` values of each target, (n, num), NaN where it is None."""
         values = [getattr(target, name) for target in drawn.targets]
         return np.array([[np.nan] * num if value is None else value for value in values])
 
     offsets = perturbed.drone_offsets_m, perturbed.rotation_offsets_deg, perturbed.target_offsets_m
     weather = {} if script.weather is None else {"weather": script.weather.model_dump()}
     points = [
-        {"perturbation": dict(state), "target": target.model_dump(include=set(LEGIBILITY)), **bystanders}
-        for state, target, bystanders in zip(perturbed.states, drawn.targets, drawn.bystanders, strict=True)
+        {"perturbation": dict(state), "target": target.model_dump(include=set(LEGIBILITY)), **point_fields}
+        for state, target, point_fields in zip(perturbed.states, drawn.targets, drawn.point_fields, strict=True)
     ]
     return Track(
         town=script.town,
@@ -267,7 +272,7 @@ def _track(script: TrackScript, drawn: DrawnFrames) -> Track:
         ),
         perturbation=Perturbation(perturbed.is_perturbed, *offsets),
         source={
-            "path_index": script.number,
+            "path_index": script.path_index,
             "scenario_id": trace.path_id,
             "scenario_name": script.town,
             "algorithm": trace.planner,
@@ -292,73 +297,79 @@ def _with_goal(track: Track, renderer: Renderer, script: TrackScript, cfg: Rende
     people = script.bystanders.people(script.clothes.looks)
     legible = [i for i in range(len(track)) if track.legibility_at(i)["legible"]]
     for i in legible[:MOST_GOAL_FRAMES]:
-        draw = partial(_draw_dressed, renderer, script, i, cfg.visible_threshold)
-        if goal := find_goal(people, i, draw, GOAL_LEAST_PX):
+        redraw = partial(_draw_dressed, renderer, script, i, cfg.visible_threshold)
+        if goal := find_goal(people, i, redraw, GOAL_LEAST_PX):
             return replace(track, goal=goal)
         advance()
     return replace(track, raw=track.raw | {"goal": {"absent": "not_told_apart" if legible else "never_legible"}})
 
 
 def _draw_dressed(
-    renderer: Renderer, script: TrackScript, i: int, visible_threshold: float, looks: Appearance, number: int
+    renderer: Renderer, script: TrackScript, i: int, visible_threshold: float, instance_id: int, looks: Appearance
 ) -> Frame:
     """Draw frame i with one person in another appearance."""
-    if number == PERSON_ID:
+    if instance_id == PERSON_ID:
         dressed = replace(script, clothes=replace(script.clothes, looks=looks))
     else:
-        dressed = replace(script, bystanders=script.bystanders.dressed(number, looks))
+        dressed = replace(script, bystanders=script.bystanders.dressed(instance_id, looks))
     return draw_frame(renderer, dressed, i, script.perturbed.poses, visible_threshold).frame
 
 
-def find_goal(people: People, i: int, draw: Callable[[Appearance, int], Frame], least_px: int) -> Goal | None:
+def find_goal(people: People, i: int, redraw: Callable[[int, Appearance], Frame], least_px: int) -> Goal | None:
     """Find the words that distinguish the target of frame i from the bystanders that have a pixel in it.
 
+    Words name only what the picture shows: the frame is drawn again with a person in another appearance, and compared.
+
     Args:
-        draw: Draws the frame with the person of an id in that appearance.
+        redraw: Draws the frame with the person of an instance id in that appearance.
         least_px: Fewest pixels by which a person shows a garment or the figure. A bystander of fewer pixels is taken as
             different from the target where the records differ.
     """
-    compared = _Comparison(people, draw, least_px)
-    picture = SeenFrame(compared.frame.ids, compared.frame.depth)
-    says = find_says(compared.people, picture, partial(compared.differs_in_slot, PERSON_ID), compared.bystander_differs)
+    comparison = _Comparison(people, redraw, least_px)
+    target_differs = partial(comparison.differs_in_slot, PERSON_ID)
+    seen = SeenFrame(comparison.frame.ids, comparison.frame.depth)
+    says = find_says(comparison.people, seen, target_differs, comparison.bystander_differs)  # slots that tell it apart
     return None if says is None else Goal(i, **words_of(says, people.target), says=says)
 
 
 class _Comparison:
-    """What people look like in one frame, compared by drawing it again with one person in another appearance."""
+    """What people look like in one frame."""
 
-    def __init__(self, people: People, draw: Callable[[Appearance, int], Frame], least_px: int) -> None:
+    def __init__(self, people: People, redraw: Callable[[int, Appearance], Frame], least_px: int) -> None:
         self.people = {PERSON_ID: people.target, **people.others}  # by instance id
-        self.frame = frame = draw(people.target, PERSON_ID)
+        self.frame = redraw(PERSON_ID, people.target)
+        self._redraw = redraw
         self._least_px = least_px
-        # Whether a person looks different in another appearance, drawn once for each: the search asks again.
-        self._differs = cache(lambda number, looks: people_differ(frame, draw(looks, number), number, least_px))
+        self._differs = cache(self._redrawn_differs)  # the search asks for the same appearance again
 
-    def bystander_differs(self, slot: str, number: int) -> bool:
-        """Return whether a bystander looks unlike the target in a slot, or is so small that only records tell."""
-        is_small = np.count_nonzero(self.frame.ids == number) < self._least_px
-        return bool(is_small) or self.differs_in_slot(number, slot, self.people[PERSON_ID])
+    def _redrawn_differs(self, instance_id: int, looks: Appearance) -> bool:
+        return people_differ(self.frame, self._redraw(instance_id, looks), instance_id, self._least_px)
 
-    def differs_in_slot(self, number: int, slot: str, other: Appearance) -> bool:
-        """Return whether a person would look different if it wore what another appearance has in a slot."""
-        person = self.people[number]
+    def bystander_differs(self, slot: str, instance_id: int) -> bool:
+        """Return whether a bystander looks unlike the target in a slot, or is too small to be seen."""
+        is_small = np.count_nonzero(self.frame.ids == instance_id) < self._least_px
+        return bool(is_small) or self.differs_in_slot(instance_id, slot, self.people[PERSON_ID])
+
+    def differs_in_slot(self, instance_id: int, slot: str, other: Appearance) -> bool:
+        """Return whether a person would look different with what another appearance has in a slot."""
+        person = self.people[instance_id]
         if slot == "figure":
-            return self._differs(number, replace(person, figure=other.figure))
+            return self._differs(instance_id, replace(person, figure=other.figure))
         color_field = f"{slot}_color"
         color, other_color = getattr(person, color_field), getattr(other, color_field)
         # The wardrobe's colours differ wherever they are visible. Whether this slot is visible is the same question for
         # all other colours, so it is asked of one appearance, and `_differs` draws it once.
         if color and other_color and color != other_color:
             other = otherwise(person, slot)
-        changes = {field: getattr(other, field) for field in (slot, color_field)}
-        return self._differs(number, replace(person, **changes))
+        changes = {name: getattr(other, name) for name in (slot, color_field)}
+        return self._differs(instance_id, replace(person, **changes))
 
 
-def people_differ(frame: Frame, other: Frame, number: int, least_px: int) -> bool:
+def people_differ(frame: Frame, other: Frame, instance_id: int, least_px: int) -> bool:
     """Return whether a person looks different to the eye in two frames that differ in its appearance only."""
-    is_person = (frame.ids == number) | (other.ids == number)
+    is_person = (frame.ids == instance_id) | (other.ids == instance_id)
     lab, other_lab = (
-        cv2.cvtColor(f.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[is_person] for f in (frame, other)
+        cv2.cvtColor(picture.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[is_person] for picture in (frame, other)
     )
     num_px = np.count_nonzero(np.linalg.norm(lab - other_lab, axis=-1) >= DIFFERENT_CONTRAST)
     return bool(num_px >= max(least_px, DIFFERENT_SHARE * np.count_nonzero(is_person)))

@@ -9,7 +9,7 @@ import logging
 import re
 import time
 import weakref
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -24,9 +24,9 @@ from cosfly.runtime.errors import ConfigError, InputError, RenderError, shown
 from cosfly.runtime.png import colours_of
 from cosfly.simulators import unrealcv_client
 from cosfly.simulators.assets import id_of, kind_of
-from cosfly.simulators.conventions import FAR_CM, camera_rotation_deg, unreal_pose, world_pose
+from cosfly.simulators.conventions import FAR_UNITS, camera_rotation_deg, unreal_pose, world_pose
 from cosfly.simulators.guard import EngineGuard
-from cosfly.simulators.unrealcv_client import OURS, NoAnswerError, UnrealCvConfig, is_refusal, spawned_by_cosfly
+from cosfly.simulators.unrealcv_client import NoAnswerError, UnrealCvConfig, UnrealCvConnection, is_refusal
 
 log = logging.getLogger(__name__)
 
@@ -48,11 +48,27 @@ class UnrealCvRenderConfig(UnrealCvConfig, ServerCommand):
     person_asset: ClassVar[str] = "/Game/TrafficSystem/Pedestrian/Base_User_Agent.Base_User_Agent_C"
 
 
+class _LevelObject(NamedTuple):
+    """An object of the server's level."""
+
+    name: str
+    color: int | None  # in the object mask, 24 bits; None without one
+    class_name: str
+    row: int | None  # of its box in the map; None if the map does not have it
+
+
 class UnrealCvRenderer(SimulatorRenderer):
     """A renderer that uses an UnrealCV server with the level of the map."""
 
     engine = "unrealcv"
     _guard: EngineGuard | None = None
+    # The following belong to one connection.
+    _server: UnrealCvConnection
+    _spawned: dict[int, str]  # names of people by instance id
+    _fov_deg: float  # of the camera; 0 if it is not set yet
+    _ids: np.ndarray  # (COLORS,) uint16 instance ids
+    _kinds: np.ndarray  # (COLORS,) uint8
+    _used_colors: set[int]
 
     # --- the server ---------------------------------------------------------------------------------------------------
 
@@ -77,55 +93,62 @@ class UnrealCvRenderer(SimulatorRenderer):
     def _begin(self, is_first: bool) -> None:
         """Read the objects of the level; at the first connection, send the camera's state to the guard."""
         self.device = f"UnrealCV {self._server.version} at {self._server.endpoint}, {self._server.level}"
-        self._spawned: dict[int, str] = {}
+        self._spawned = {}
         self._fov_deg = 0.0
         if is_first and self._guard is not None:
             properties = [f"{CAMERA}/{what}" for what in ("size", "fov", "pose")]
             state = zip(properties, self._server.ask(*(f"vget {name}" for name in properties)), strict=True)
             self._guard.note([f"vset {name} {text!s}" for name, text in state if not is_refusal(text)])
-        names = str(*self._server.ask("vget /objects"))
-        leftover = spawned_by_cosfly(names)  # by a connection that broke
+        (answer,) = self._server.ask("vget /objects")
+        leftover = unrealcv_client.spawned_by_cosfly(str(answer))  # by a connection that broke
         self._server.run(*(f"vset /object/{name}/destroy" for name in leftover))
-        self._link([name for name in names.split() if name not in leftover])
+        objects = self._read_objects([name for name in str(answer).split() if name not in leftover])
+        num_doubtful = self._make_tables(objects)
+        self._check_level({part.name: part.row for part in objects if part.row is not None}, num_doubtful)
         self._server.run(f"vset {CAMERA}/size {self._size_px[0]} {self._size_px[1]}")
 
-    def _link(self, names: list[str]) -> None:
-        """Make the tables from colours of the object mask to instance ids and kinds."""
+    def _read_objects(self, names: list[str]) -> list[_LevelObject]:
+        """Ask for the colours and classes of objects, and find their boxes."""
+        row_of_id = {int(box_id): row for row, box_id in enumerate(self._map.ids)}
+        queries = (f"vget /object/{name}/{what}" for name in names for what in ("color", "uclass_name"))
+        answers = self._server.ask(*queries)
+        return [
+            _LevelObject(name, _color_of(color), str(class_name), row_of_id.get(id_of(name)))
+            for name, color, class_name in zip(names, answers[::2], answers[1::2], strict=True)
+        ]
+
+    def _make_tables(self, objects: list[_LevelObject]) -> int:
+        """Make the tables from colours of the object mask to instance ids and kinds.
+
+        Return the number of objects without a colour of their own: their pixels get the id of another object, or none.
+        """
         ids = instance_ids(self._map, self._num_others)
-        rows = {int(k): row for row, k in enumerate(self._map.ids)}
         self._ids = np.full(COLORS, NO_INSTANCE, dtype=np.uint16)
         self._kinds = np.full(COLORS, KINDS["NONE"], dtype=np.uint8)
-        queries = (f"vget /object/{name}/{what}" for name in names for what in ("color", "uclass_name"))
-        answers = iter(self._server.ask(*queries))
-        linked = dict[str, int]()
-        self._used = set[int]()
-        num_doubtful = 0
-        for name in names:
-            color = _color_of(next(answers))
-            class_name = str(next(answers))
-            row = rows.get(id_of(name))
-            if row is not None:
-                linked[name] = row
-            if color is None or color in self._used:
-                num_doubtful += 1
+        self._used_colors = set()
+        for part in objects:
+            if part.color is None or part.color in self._used_colors:
                 continue
-            self._used.add(color)
-            self._ids[color] = NO_INSTANCE if row is None else ids[row]
-            self._kinds[color] = KINDS[kind_of(class_name) or "Other"] if row is None else self._map.kinds[row]
-        if not linked:
+            self._used_colors.add(part.color)
+            if part.row is None:
+                self._kinds[part.color] = KINDS[kind_of(part.class_name) or "Other"]
+            else:
+                self._ids[part.color] = ids[part.row]
+                self._kinds[part.color] = self._map.kinds[part.row]
+        return len(objects) - len(self._used_colors)
+
+    def _check_level(self, row_of: dict[str, int], num_doubtful: int) -> None:
+        """Check that the level is that of the map, at its scale. row_of: boxes of the map by the names of objects."""
+        if not row_of:
             what = "none of the boxes of the map is in the level that the server has loaded"
             fix = "export the map from this level (cosfly maps --source unrealcv)"
             raise InputError(what, where=self._server.where, got=f"the map {self._map.name}", fix=fix)
-        if len(linked) < len(self._map) or num_doubtful:
-            note = "%s: %d of %d boxes are objects of the level; %d objects share their colour with another"
-            log.warning(note, self._server.where, len(linked), len(self._map), num_doubtful)
-        self._check_scale(linked)
-
-    def _check_scale(self, linked: dict[str, int]) -> None:
-        """Compare the positions of objects with the map's boxes, to find another scale."""
-        names = list(linked)[:: max(1, len(linked) // MOST_CHECKED)]
+        if len(row_of) < len(self._map) or num_doubtful:
+            note = "%s: %d of %d boxes are objects of the level; %d objects have no colour of their own"
+            log.warning(note, self._server.where, len(row_of), len(self._map), num_doubtful)
+        names = list(row_of)[:: max(1, len(row_of) // MOST_CHECKED)]
         answers = self._server.ask(*(f"vget /object/{name}/bounds" for name in names))
-        bounds = {linked[name]: self._server.numbers(answer, 6) for name, answer in zip(names, answers, strict=True)}
+        bounds = {row_of[name]: self._server.numbers(answer, 6) for name, answer in zip(names, answers, strict=True)}
         middles = {row: np.reshape(ends, (2, 3)).mean(axis=0) for row, ends in bounds.items() if ends}
         if not middles:
             return
@@ -169,23 +192,23 @@ class UnrealCvRenderer(SimulatorRenderer):
             fix = "set render.backend to `gl` or `carla`, or render.weather_mode to `off`"
             raise RenderError("the renderer `unrealcv` cannot draw weather", where=self.device, fix=fix)
         with self._server.asking("UnrealCV did not remove people"):
-            for number in list(self._spawned):
-                self._server.run(self._removal(number))
+            for instance_id in list(self._spawned):
+                self._server.run(self._forget(instance_id))
 
     def _frame(self, camera_pose: np.ndarray, fov_deg: float, people: PosedPeople) -> Frame:
         place, turn = self._in_level(camera_pose[:3, 3], camera_rotation_deg(camera_pose))
         try:
-            commands = ["vset /action/game/resume", *(self._removal(n) for n in self._spawned.keys() - people.keys())]
-            for number, person in people.items():
-                commands += self._placing(number, person)
+            commands = ["vset /action/game/resume"]
+            commands += [self._forget(instance_id) for instance_id in self._spawned.keys() - people.keys()]
+            for instance_id, person in people.items():
+                commands += self._placing(instance_id, person)
             if fov_deg != self._fov_deg:
                 commands.append(f"vset {CAMERA}/fov {fov_deg:.6f}")
             self._server.run(*commands, f"vset {CAMERA}/pose {place} {turn}")
             self._fov_deg = fov_deg
             time.sleep(self._cfg.settle_delay_s)
-            replies = ("location", "lit png", "object_mask png", "depth npy")
-            commands = ["vset /action/game/pause", *(f"vget {CAMERA}/{what}" for what in replies)]
-            _, location, lit, mask, depth = self._server.ask(*commands)
+            queries = [f"vget {CAMERA}/{what}" for what in ("location", "lit png", "object_mask png", "depth npy")]
+            _, location, lit, mask, depth = self._server.ask("vset /action/game/pause", *queries)
             self._check_place(camera_pose[:3, 3], location)
             return self._decoded(lit, mask, depth)
         except (NoAnswerError, InputError) as error:
@@ -204,14 +227,15 @@ class UnrealCvRenderer(SimulatorRenderer):
             raise NoAnswerError(f"the server sent {location!r} instead of the three numbers of the camera's position")
         found_m = world_pose([*(part / self._cfg.coord_scale for part in numbers), 0.0, 0.0, 0.0])[0]
         found_m[2] -= self._cfg.coord_z_offset
-        if np.linalg.norm(found_m - position_m) > SAME_PLACE_M:
-            both = np.stack([found_m, position_m])
-            over_m = both[:, 2] - self._map.ground_z_m
-            heights = zip(both.round(2).tolist(), over_m, strict=True)
-            got, expected = (f"{point}, {over:.1f} m over the ground" for point, over in heights)
-            what = "the camera is not at the requested position"
-            fix = "switch off what moves the camera in the level, such as gravity or a script"
-            raise RenderError(what, where=self.device, got=got, expected=expected, fix=fix)
+        if np.linalg.norm(found_m - position_m) <= SAME_PLACE_M:
+            return
+
+        def described(point_m: np.ndarray) -> str:
+            return f"{point_m.round(2).tolist()}, {point_m[2] - self._map.ground_z_m:.1f} m over the ground"
+
+        what = "the camera is not at the requested position"
+        fix = "switch off what moves the camera in the level, such as gravity or a script"
+        raise RenderError(what, where=self.device, got=described(found_m), expected=described(position_m), fix=fix)
 
     def _decoded(self, lit: str | bytes, mask: str | bytes, depth: str | bytes) -> Frame:
         """Convert a server's pictures to a frame; raise InputError if one is damaged."""
@@ -231,11 +255,11 @@ class UnrealCvRenderer(SimulatorRenderer):
                     expected=f"{width_px} x {height_px} px",
                     fix="set render.width_px and render.height_px to the size that the server sends",
                 )
-        colors = pictures[1].astype(np.int64) @ [1 << 16, 1 << 8, 1]
+        colors = pictures[1].astype(np.int64) @ [1 << 16, 1 << 8, 1]  # red, green, blue as one number
         kinds = self._kinds[colors]
         ids = self._ids[colors]
         depth_m = raw / np.float32(self._cfg.coord_scale)
-        is_sky = ~(raw < FAR_CM)
+        is_sky = ~(raw < FAR_UNITS)  # NaN is sky too
         depth_m[depth_m < NEAR_M] = INVALID_DEPTH_M
         depth_m[is_sky] = SKY_DEPTH_M
         kinds[is_sky] = KINDS["Sky"]
@@ -244,34 +268,40 @@ class UnrealCvRenderer(SimulatorRenderer):
 
     # --- people -------------------------------------------------------------------------------------------------------
 
-    def _placing(self, number: int, person: PosedPerson) -> list[str]:
-        """Return the commands that place a person; one who walks starts earlier on the way, by the settle delay."""
-        name = self._spawned.get(number) or self._spawn(number)
+    def _placing(self, instance_id: int, person: PosedPerson) -> list[str]:
+        """Spawn a person who is not in the level yet, and return the commands that place the person.
+
+        One who walks starts earlier on the way, by the settle delay.
+        """
+        name = self._spawned.get(instance_id) or self._spawn(instance_id)
         animate = self._cfg.animate
-        position_m, turn_deg, _, speed_mps = placement_of(person, self._cfg.settle_delay_s if animate else 0.0)
-        place, turn = self._in_level(position_m, turn_deg)
+        placement = placement_of(person, self._cfg.settle_delay_s if animate else 0.0)
+        place, turn = self._in_level(placement.hip_m, placement.rotation_deg)
         commands = [f"vset /object/{name}/location {place}", f"vset /object/{name}/rotation {turn}"]
-        if animate:
-            speed = f"vbp {name} SetMaxSpeed {speed_mps * self._cfg.coord_scale:.3f}"
-            commands += [speed, f"vbp {name} MoveForward"] if speed_mps > 0.0 else [f"vbp {name} StopAgent"]
+        if animate and placement.speed_mps > 0.0:
+            speed = f"{placement.speed_mps * self._cfg.coord_scale:.3f}"
+            commands += [f"vbp {name} SetMaxSpeed {speed}", f"vbp {name} MoveForward"]
+        elif animate:
+            commands.append(f"vbp {name} StopAgent")
         return commands
 
-    def _spawn(self, number: int) -> str:
+    def _spawn(self, instance_id: int) -> str:
         """Spawn a person, in a colour that no other object has; return its name."""
-        name = f"{OURS}{number}"
-        color = next(c for c in range(COLORS - 1, 0, -1) if c not in self._used)
+        name = f"{unrealcv_client.OURS}{instance_id}"
+        color = next(c for c in range(COLORS - 1, 0, -1) if c not in self._used_colors)
         paint = f"{color >> 16} {color >> 8 & 0xFF} {color & 0xFF}"
         self._server.run(
             f"vset /objects/spawn_bp_asset {self._cfg.person_asset} {name}", f"vset /object/{name}/color {paint}"
         )
-        self._used.add(color)
-        self._ids[color] = number
+        self._used_colors.add(color)
+        self._ids[color] = instance_id
         self._kinds[color] = KINDS["Pedestrians"]
-        self._spawned[number] = name
+        self._spawned[instance_id] = name
         return name
 
-    def _removal(self, number: int) -> str:
-        return f"vset /object/{self._spawned.pop(number)}/destroy"
+    def _forget(self, instance_id: int) -> str:
+        """Forget a spawned person; return the command that removes the person from the level."""
+        return f"vset /object/{self._spawned.pop(instance_id)}/destroy"
 
 
 def _color_of(answer: str | bytes) -> int | None:

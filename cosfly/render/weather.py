@@ -151,12 +151,12 @@ def _read_pool(
     if path is None:
         return default
     presets = build(model, read_yaml(path), path).presets
-    pool = {preset_token(key): preset for key, preset in presets.items()}
+    pool = {preset_token(preset_name): preset for preset_name, preset in presets.items()}
     if len(pool) < len(presets):
         tokens = Counter(map(preset_token, presets))
-        twins = [key for key in presets if tokens[preset_token(key)] > 1]
+        equal_names = [name for name in presets if tokens[preset_token(name)] > 1]
         what = "two presets have the same name; case, blanks and hyphens are ignored"
-        raise ConfigError(what, where=path, got=", ".join(twins), fix="rename one of them")
+        raise ConfigError(what, where=path, got=", ".join(equal_names), fix="rename one of them")
     if problems := _unknown(name, pool, field):
         raise ConfigError("; ".join(problems), where=path)
     return pool

@@ -12,11 +12,11 @@ from cosfly.runtime.io import sha256_bytes
 
 
 class Asset(NamedTuple):
-    """A family of assets. size_m: full size of those for which the size table holds only a placeholder."""
+    """A family of assets."""
 
-    pattern: str
+    pattern: str  # of their names
     kind: str
-    size_m: Sequence[float] | None = None
+    size_m: Sequence[float] | None = None  # full size of those for which the size table holds only a placeholder
 
 
 _TABLE = read_yaml(Path(__file__).with_name("assets.yaml"))

@@ -1,8 +1,8 @@
 """Conventions of CARLA and Unreal, and their conversion: axes, pictures of depth and of tags.
 
-Their axes are left-handed (`cosfly.geometry.axes`); a pose is x, y, z, pitch, yaw, roll in m and degrees. Pictures are
-BGRA bytes: depth in 24 bits up to 1000 m, tags as the semantic number in red and an actor's number in green (low byte)
-and blue (high byte).
+Their axes are left-handed (`cosfly.geometry.axes`); a pose is x, y, z, pitch, yaw, roll in m and degrees. Pictures of
+CARLA are BGRA bytes: depth in 24 bits up to 1000 m, tags as the semantic number in red and an actor's number in green
+(low byte) and blue (high byte).
 """
 
 from collections.abc import Sequence
@@ -16,16 +16,16 @@ DEPTH_RANGE_M = 1000.0
 DEPTH_STEPS = 2**24 - 1
 ACTOR_BITS = 0xFFFF  # the bits of an actor's number that pictures hold
 CM_PER_M = 100.0
-FAR_CM = 65504.0  # the largest half-precision number: UnrealCV's depth of the sky and of all beyond
+FAR_UNITS = 65504.0  # the largest half-precision number: UnrealCV's depth of the sky, in units of the server
 
 
 def unreal_pose(position_m: np.ndarray, rotation_deg: np.ndarray) -> list[float]:
     """Convert a pose, (3,) m and (3,) pitch, yaw, roll in degrees, to x, y, z, pitch, yaw, roll of Unreal."""
-    return (mirror_poses(np.array([*position_m, *rotation_deg])) + 0.0).tolist()
+    return (mirror_poses(np.array([*position_m, *rotation_deg])) + 0.0).tolist()  # + 0.0: no negative zeros
 
 
 def world_pose(pose: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Convert a pose of Unreal to position, (3,) m, and rotation, (3,) degrees."""
+    """Convert a pose of Unreal, in m and degrees, back to position, (3,) m, and rotation, (3,) degrees."""
     mirrored = mirror_poses(np.array(pose)) + 0.0  # no negative zeros
     return mirrored[:3], mirrored[3:]
 

@@ -1,6 +1,8 @@
 """A checked connection to an UnrealCV server, as SimWorld runs one: settings, and errors that name host, port, version.
+
 It works around faults of the package `unrealcv`, which waits forever for a greeting, reads from closed connections,
-and prints. A server has one client at a time."""
+and prints. A server has one client at a time.
+"""
 
 import contextlib
 import io
@@ -49,7 +51,7 @@ class UnrealCvConnection:
         self.level = ""
         self._client = _client(cfg, port)
         if self._client is None:
-            raise NoAnswerError(_why_not(cfg.host, port))
+            raise NoAnswerError(_why_no_greeting(cfg.host, port))
 
     @property
     def where(self) -> str:
@@ -161,7 +163,7 @@ def _client(cfg: UnrealCvConfig, port: int) -> Any:
         socket.setdefaulttimeout(before_s)
 
 
-def _why_not(host: str, port: int) -> str:
+def _why_no_greeting(host: str, port: int) -> str:
     """Return why no server greeted the client."""
     try:
         socket.create_connection((host, port), PROBE_S).close()

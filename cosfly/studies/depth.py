@@ -27,8 +27,7 @@ PANEL_PX = (480, 270)  # width, height
 PROFILE_TOP_PX, PROFILE_BOTTOM_PX = 30.0, 10.0  # margins of the profile: its legend is above
 LEGEND_LEFT_PX, LEGEND_BASELINE_PX, LEGEND_GAP_PX, LEGEND_SCALE = 10, 18, 16, 0.45
 PROFILE_COLORS: dict[str, Color] = {"truth": (30, 30, 30), "10-bit": (240, 150, 40), "8-bit": (215, 60, 50)}
-# Figure of a coding over the measured pixels -> column of the table and form of its numbers. Errors are against the
-# reference.
+# Figure of a coding over the measured pixels -> title of its column and format. Errors are against the reference.
 COLUMNS = {
     "coding": ("coding", "{}"),
     "unique": ("unique values", "{:,}"),
@@ -80,8 +79,8 @@ def study_of(reference_m: np.ndarray, frame: str) -> tuple[dict[str, Any], dict[
 def _check_depths(depths_m: np.ndarray, frame: str) -> None:
     if not depths_m.size or depths_m.min() == depths_m.max() or depths_m.min() < 0:
         got = f"{depths_m.min():g} to {depths_m.max():g} m" if depths_m.size else "no measured pixel"
-        what, expected = "the depth image needs two different depths", "at least two different depths, none below 0 m"
-        raise InputError(what, where=frame, got=got, expected=expected)
+        what = "the depth image needs two different depths"
+        raise InputError(what, where=frame, got=got, expected="at least two different depths, none below 0 m")
 
 
 def quantised(reference_m: np.ndarray, measured: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray]:
@@ -119,8 +118,10 @@ def _edge_correlation(decoded_m: np.ndarray, exact_m: np.ndarray, measured: np.n
     """Return Pearson's correlation of Sobel gradient lengths where the whole 3 x 3 window is measured; 1 if nowhere."""
     window = np.ones((3, 3), np.uint8)
     inner = cv2.erode(measured.astype(np.uint8), window, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    slopes = [[cv2.Sobel(image, cv2.CV_64F, *axis) for axis in ((1, 0), (0, 1))] for image in (decoded_m, exact_m)]
-    lengths = [np.hypot(*pair)[inner] for pair in slopes]
+    lengths = [
+        np.hypot(cv2.Sobel(depth_m, cv2.CV_64F, 1, 0), cv2.Sobel(depth_m, cv2.CV_64F, 0, 1))[inner]
+        for depth_m in (decoded_m, exact_m)
+    ]
     if not inner.any() or min(length.std() for length in lengths) == 0:
         return 1.0
     return float(np.corrcoef(lengths)[0, 1])
@@ -128,8 +129,10 @@ def _edge_correlation(decoded_m: np.ndarray, exact_m: np.ndarray, measured: np.n
 
 def markdown(study: dict[str, Any]) -> str:
     """Return the table of the study in the paper's columns."""
-    pairs = [[(row[name], form) for name, (_, form) in COLUMNS.items()] for row in study["rows"]]
-    texts = [["no error" if value is None else form.format(value) for value, form in row] for row in pairs]
+    texts = [
+        ["no error" if row[name] is None else text.format(row[name]) for name, (_, text) in COLUMNS.items()]
+        for row in study["rows"]
+    ]
     size = f"{study['width_px']} x {study['height_px']} px"
     ends = f"{study['min_m']:.2f} to {study['max_m']:.2f} m"
     measured = f"{study['share_measured']:.1%} of the pixels measured; errors against {study['truth']}."

@@ -12,16 +12,17 @@ from typing import Any
 import cv2
 import numpy as np
 
-import cosfly.render.stage
 from cosfly.formats.frames import Camera, level_name, read_rgb, rgb_bytes
 from cosfly.formats.playback import Track
 from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
-from cosfly.geometry.axes import box_iou, intrinsic_matrix
+from cosfly.geometry.axes import box_iou
+from cosfly.render import stage as rendering
 from cosfly.render.camera import ZoomConfig
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, write_json
+from cosfly.viz.frame_views import spread
 from cosfly.viz.tables import TextTable, cells
 from cosfly.viz.topview import captioned_grid
 
@@ -32,11 +33,6 @@ MAGNIFICATION = 5.0  # of digital zoom, as in fig:zoom_fidelity
 MOST_SHOWN = 4  # tracks in zoom_levels.png
 TILE_WIDTH_PX, PANEL_WIDTH_PX = 480, 960
 TARGET_COLOR, CROP_COLOR = (255, 214, 10), (255, 40, 40)  # RGB
-
-
-def camera_of(cfg: RenderConfig, fov_deg: float) -> Camera:
-    """Return the camera of the settings with another horizontal field of view."""
-    return Camera(cfg.width_px, cfg.height_px, intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg))
 
 
 def enlarged_fov_deg(fov_deg: float, magnification: float) -> float:
@@ -64,7 +60,7 @@ def run(
         level = {"fovs_deg": (fov_deg,), "zoom": ZoomConfig(), "frame_stride": every, "path_index": path_index}
         files = {"tracks": ("clean",), "modalities": ("rgb",), "first_timestamp": 0}
         settings = cfg.model_copy(update=level | files | {"weather_mode": "off"})
-        tree = cosfly.render.stage.run(settings, boxes, simplified, traces, tree_of(out, fov_deg), **options)
+        tree = rendering.run(settings, boxes, simplified, traces, tree_of(out, fov_deg), **options)
         return [read_track(folder) for folder in find_tracks(tree)]
 
     levels = {fov: draw(fov) for fov in sorted(set(cfg.fovs_deg), reverse=True)}
@@ -73,7 +69,7 @@ def run(
     (longer,) = draw(enlarged_fov_deg(wide_deg, MAGNIFICATION), first.source["path_index"])
     write_bytes(out / "zoom_levels.png", _draw_levels(levels))
     write_bytes(out / "zoom_fidelity.png", _draw_fidelity(first, longer))
-    rows = [_level_row(camera_of(cfg, fov), tracks) for fov, tracks in levels.items()]
+    rows = [_level_row(rendering.camera_of(cfg, fov), tracks) for fov, tracks in levels.items()]
     settings = cfg.model_dump(mode="json") | {"every": every}
     product = out / "zoom_study.json"
     write_json(product, {**FORMAT.header, "town": first.town, "settings": settings, "levels": rows})
@@ -129,9 +125,8 @@ def _best_frame(track: Track) -> int:
 def _draw_levels(levels: dict[float, list[Track]]) -> bytes:
     """Draw one frame of up to four tracks, one row each, at every level (fig:zoom_demo); return a PNG."""
     wide = next(iter(levels.values()))
-    picked = np.unique(np.linspace(0, len(wide) - 1, min(len(wide), MOST_SHOWN)).round().astype(int))
     panels = []
-    for k in picked.tolist():
+    for k in spread(len(wide), MOST_SHOWN):
         i = _best_frame(wide[k])
         for fov, tracks in levels.items():
             rgb = read_rgb(tracks[k].frame_folder(i)).copy()

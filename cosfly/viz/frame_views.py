@@ -72,13 +72,13 @@ class Pictures:
     def sentence(self, language: Language) -> str:
         """Return the sentence of a prompt that describes these pictures."""
         count = len(self.views)
-        is_tiled = self.layout == "tiled" and len(self.views) > 1
-        sentence = _SENTENCES["frame"][language][3 if is_tiled else min(count, 2)]
+        is_tiled = self.layout == "tiled" and count > 1
+        frame_sentence = _SENTENCES["frame"][language][3 if is_tiled else min(count, 2)]  # none, one, several, tiled
         numbers = {"range": self.depth_range_m, "middle": MIDDLE}
         words = [_SENTENCES["views"][language][view].format(**numbers) for view in self.views]
         listed = {"en": ", ", "zh": "、"}[language].join(words)
-        scale = 2 if "middle" in self.views else int(is_tiled)
-        return sentence.format(count=count, views=listed) + _SENTENCES["pixels"][language][scale].format(*self.size_px)
+        pixel_sentence = _SENTENCES["pixels"][language][2 if "middle" in self.views else int(is_tiled)]
+        return frame_sentence.format(count=count, views=listed) + pixel_sentence.format(*self.size_px)
 
 
 def frame_label(number: int) -> str:

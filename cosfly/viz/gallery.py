@@ -34,8 +34,8 @@ def contact_sheet(tree: Path, out_png: Path, choice: TrackChoice = ALL_TRACKS) -
     folders = find_tracks(tree, choice)
     rows = [_row(read_track(folder)) for folder in folders[:MOST_ROWS]]
     heading = np.full((26, rows[0].shape[1], 3), 60, np.uint8)
-    shown = "" if len(folders) <= MOST_ROWS else f", the first {MOST_ROWS} shown"
-    draw_text(heading, f"{len(folders)} tracks{shown}", 8, 18, 0.5, (255, 255, 255))
+    note = "" if len(folders) <= MOST_ROWS else f", the first {MOST_ROWS} shown"
+    draw_text(heading, f"{len(folders)} tracks{note}", 8, 18, 0.5, (255, 255, 255))
     write_bytes(out_png, _small_png(np.vstack([heading, *rows])))
 
 
@@ -108,15 +108,17 @@ def _frames_with(track: Track, *names: str) -> list[int]:
 def _row(track: Track) -> np.ndarray:
     frames = _frames_with(track, "rgb.png")
     tiles = []
-    for i in (frames[k] for k in spread(len(frames), NUM_RGB_TILES)):
+    for k in spread(len(frames), NUM_RGB_TILES):
+        i = frames[k]
         picture = _boxed(read_rgb(track.frame_folder(i)), track, i)
         tiles.append(_tile(picture, f"t = {track.time_s[i]:.1f} s"))
     tiles += [np.zeros_like(tiles[0])] * (NUM_RGB_TILES - len(tiles))
     middle = track.frame_folder(frames[len(frames) // 2])
     for view in ("depth", "segmentation"):
-        is_there = frame_path(middle, VIEW_FILES[view]).is_file()
-        picture = read_view(middle, view) if is_there else np.zeros_like(tiles[0])
-        tiles.append(_tile(picture, view if is_there else f"no {VIEW_FILES[view]}"))
+        if frame_path(middle, VIEW_FILES[view]).is_file():
+            tiles.append(_tile(read_view(middle, view), view))
+        else:
+            tiles.append(_tile(np.zeros_like(tiles[0]), f"no {VIEW_FILES[view]}"))
     strip = np.full((22, TILE_PX[0] * len(tiles), 3), 24, np.uint8)
     visible = f"target visible in {int(track.target.visible.sum())} of {len(track)} frames"
     fov = " to ".join(dict.fromkeys(f"{fov:.0f}" for fov in track.fovs_deg))

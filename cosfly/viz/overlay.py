@@ -1,8 +1,9 @@
-"""A frame's labels drawn over its colours: the 3D boxes of map, target and bystanders, with ids and
-distances.
+"""A frame's labels drawn over its colours: the 3D boxes of map, target and bystanders, with ids and distances.
 
 The boxes are projected again from `meta.json` and the map, so a line that does not fit reveals an error in either.
 """
+
+from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -20,8 +21,35 @@ TARGET_COLOR, OTHERS_COLOR = (255, 214, 10), (90, 220, 255)
 LEAST_SHARE = 5e-4  # of the picture: smaller boxes are skipped
 MOST_LABELS = 16  # of the largest boxes
 FAR_PX = 20_000.0  # lines end this far beyond the picture
+WIDTH_PX = 1280.0  # of a picture whose lines and letters have the sizes below; those of others are scaled
+MAP_LINE_PX, MOVING_LINE_PX = 1, 2
+TEXT_SIZE, LEAST_TEXT_SIZE = 0.45, 0.33
+PALENESS = 0.45  # share by which colours of the map are moved towards white
+LABEL_BACKGROUND = (20, 20, 20)
+LABEL_GAP_PX = 4  # between a box and its label
 # Pairs of corners, in the order of geometry.box_corners, that an edge of a box joins.
 EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
+
+
+class _Label(NamedTuple):
+    """A text over a box."""
+
+    text: str
+    x: float  # px, of its middle
+    y: float  # px, of the top of the box
+    color: Color
+
+
+class _Area(NamedTuple):
+    """A rectangle of the picture, px."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+
+    def overlaps(self, other: _Area) -> bool:
+        return self.x0 < other.x1 and other.x0 < self.x1 and self.y0 < other.y1 and other.y0 < self.y1
 
 
 class _Box(NamedTuple):
@@ -49,9 +77,9 @@ class Overlay:
         picture = np.ascontiguousarray(rgb).copy()
         camera_pose = world_from_camera(meta.drone_pose[:3], meta.drone_pose[3:])
         intrinsic = np.array(meta.camera.intrinsic)
-        scale = picture.shape[1] / 1280.0
-        labels: list[tuple[str, float, float, Color]] = []
-        for boxes, width in ((self._seen(ids), 1), (_moving(meta), 2)):
+        scale = picture.shape[1] / WIDTH_PX
+        labels: list[_Label] = []  # the more important ones last
+        for boxes, width in ((self._largest_last(ids), MAP_LINE_PX), (_moving(meta), MOVING_LINE_PX)):
             for box in boxes:
                 lines = _lines(box.corners_m, camera_pose, intrinsic, meta.camera.near_m)
                 for begin, end in lines:
@@ -59,17 +87,17 @@ class Overlay:
                 if box.label and lines:
                     ends = np.array(lines).reshape(-1, 2)
                     text = f"{box.label} {np.linalg.norm(box.center_m - camera_pose[:3, 3]):.1f} m"
-                    labels.append((text, float(ends[:, 0].mean()), float(ends[:, 1].min()), box.color))
-        _write_labels(picture, labels, max(0.33, 0.45 * scale))
+                    labels.append(_Label(text, float(ends[:, 0].mean()), float(ends[:, 1].min()), box.color))
+        _write_labels(picture, labels, max(LEAST_TEXT_SIZE, TEXT_SIZE * scale))
         return picture
 
-    def _seen(self, ids: np.ndarray) -> list[_Box]:
+    def _largest_last(self, ids: np.ndarray) -> list[_Box]:
         """Return the boxes that cover enough of the picture, without ground, the largest last."""
         drawn_ids, counts = np.unique(ids, return_counts=True)
-        pixels = dict(zip(drawn_ids.tolist(), counts.tolist(), strict=True))
-        seen = np.array([pixels.get(int(number), 0) for number in self.instance_ids.tolist()])
-        rows = np.flatnonzero((seen >= LEAST_SHARE * ids.size) & ~self.box_map.is_any_of(GROUND_KINDS))
-        rows = rows[np.argsort(seen[rows], kind="stable")]
+        num_px_of = dict(zip(drawn_ids.tolist(), counts.tolist(), strict=True))
+        num_px = np.array([num_px_of.get(instance_id, 0) for instance_id in self.instance_ids.tolist()])
+        rows = np.flatnonzero((num_px >= LEAST_SHARE * ids.size) & ~self.box_map.is_any_of(GROUND_KINDS))
+        rows = rows[np.argsort(num_px[rows], kind="stable")]
         turns = rotation_matrices(np.radians(self.box_map.rotations_deg[rows]))
         boxes = []
         for rank, (row, turn) in enumerate(zip(rows.tolist(), turns, strict=True)):
@@ -77,7 +105,7 @@ class Overlay:
             center_m = self.box_map.centers[row]
             corners_m = box_corners(np.zeros(3), self.box_map.half_extents[row]) @ turn.T + center_m
             label = f"{kind} {self.instance_ids[row]}" if rank >= len(rows) - MOST_LABELS else ""
-            color = [round(255 - 0.55 * (255 - value)) for value in COLORS.get(kind, OTHER_COLOR)]  # lighter
+            color = [round(255 - (1 - PALENESS) * (255 - value)) for value in COLORS.get(kind, OTHER_COLOR)]
             boxes.append(_Box(corners_m, center_m, color, label))
         return boxes
 
@@ -100,32 +128,36 @@ def _lines(
     points = (corners_m - camera_pose[:3, 3]) @ camera_pose[:3, :3]
     lines = []
     for a, b in EDGES:
-        ends = np.stack([points[a], points[b]])
-        (za, zb) = ends[:, 2]
-        if max(za, zb) <= near_m:
+        if max(points[a, 2], points[b, 2]) <= near_m:
             continue
-        for k, behind in enumerate(ends[:, 2] < near_m):
-            if behind:
-                ends[k] += (ends[1 - k] - ends[k]) * (near_m - ends[k, 2]) / (ends[1 - k, 2] - ends[k, 2])
+        ends = np.stack([_clipped(points[a], points[b], near_m), _clipped(points[b], points[a], near_m)])
         uv = ends @ intrinsic.T
-        places = np.clip(uv[:, :2] / uv[:, 2:], -FAR_PX, FAR_PX).round().astype(int)
-        lines.append(((int(places[0, 0]), int(places[0, 1])), (int(places[1, 0]), int(places[1, 1]))))
+        pixels = np.clip(uv[:, :2] / uv[:, 2:], -FAR_PX, FAR_PX).round().astype(int)
+        lines.append(((int(pixels[0, 0]), int(pixels[0, 1])), (int(pixels[1, 0]), int(pixels[1, 1]))))
     return lines
 
 
-def _write_labels(picture: np.ndarray, labels: list[tuple[str, float, float, Color]], size: float) -> None:
-    """Write labels (text, x px, y px, colour). A label that overlaps a later one of the list is skipped."""
-    height, width = picture.shape[:2]
-    taken: list[tuple[float, float, float, float]] = []
-    for text, x, y, color in reversed(labels):
-        if not (0 <= x < width and -height / 2 <= y < height):
+def _clipped(end: np.ndarray, other_end: np.ndarray, near_m: float) -> np.ndarray:
+    """Return an end of a line, (3,) in camera axes, moved along the line to the near plane if it is in front of it."""
+    if end[2] >= near_m:
+        return end
+    return end + (other_end - end) * (near_m - end[2]) / (other_end[2] - end[2])
+
+
+def _write_labels(picture: np.ndarray, labels: list[_Label], size: float) -> None:
+    """Write labels into a picture, in place. A label that overlaps a later one of the list is skipped."""
+    height_px, width_px = picture.shape[:2]
+    taken: list[_Area] = []
+    for label in reversed(labels):
+        # A box may begin above the picture: then its label is written at the upper edge.
+        if not (0 <= label.x < width_px and -height_px / 2 <= label.y < height_px):
             continue
-        (long, high), _ = cv2.getTextSize(text, FONT, size, 1)
-        begin = float(np.clip(x - long / 2, 2, max(2, width - long - 2)))
-        baseline = float(np.clip(y - 4, high + 2, height - 4))
-        x0, y0, x1, y1 = label = begin - 2, baseline - high - 2, begin + long + 2, baseline + 3
-        if any(x0 < t[2] and t[0] < x1 and y0 < t[3] and t[1] < y1 for t in taken):
+        (text_width_px, text_height_px), _ = cv2.getTextSize(label.text, FONT, size, 1)
+        left = float(np.clip(label.x - text_width_px / 2, 2, max(2, width_px - text_width_px - 2)))
+        baseline = float(np.clip(label.y - LABEL_GAP_PX, text_height_px + 2, height_px - 4))
+        area = _Area(left - 2, baseline - text_height_px - 2, left + text_width_px + 2, baseline + 3)
+        if any(area.overlaps(other) for other in taken):
             continue
-        taken.append(label)
-        cv2.rectangle(picture, (round(x0), round(y0)), (round(x1), round(y1)), (20, 20, 20), -1)
-        draw_text(picture, text, begin, baseline, size, color)
+        taken.append(area)
+        cv2.rectangle(picture, (round(area.x0), round(area.y0)), (round(area.x1), round(area.y1)), LABEL_BACKGROUND, -1)
+        draw_text(picture, label.text, left, baseline, size, label.color)

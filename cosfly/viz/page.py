@@ -71,7 +71,6 @@ def _environment(is_markdown: bool = False) -> Environment:
         environment.filters |= {
             "code": lambda text: Markup(markdown_code(text)),
             "codes": lambda names: Markup(", ".join(map(markdown_code, names))),
-            "g": "{:g}".format,
             "safe": Markup,
         }
     else:

@@ -72,29 +72,29 @@ def run(
     if len(town_drawn) < len(all_drawn):
         notes.append(f"{len(all_drawn) - len(town_drawn):,} tracks of other towns are not shown")
     tracks += [_of_drawn(drawn) for drawn in town_drawn]
-    names = list(dict.fromkeys([path.path_id for path in pedestrians] + [track.path for track in tracks]))
-    shown = names[:MOST_PATHS]
-    if len(names) > MOST_PATHS:
-        notes.append(f"{MOST_PATHS:,} of {len(names):,} paths are shown")
-    tracks = [track for track in tracks if track.path in shown]
-    content: dict[str, Any] = {
+    all_paths = list(dict.fromkeys([path.path_id for path in pedestrians] + [track.path for track in tracks]))
+    path_ids = all_paths[:MOST_PATHS]
+    if len(all_paths) > MOST_PATHS:
+        notes.append(f"{MOST_PATHS:,} of {len(all_paths):,} paths are shown")
+    tracks = [track for track in tracks if track.path in path_ids]
+    notes += _add_pictures(tracks, picture_px)
+    content = {
         **_boxes(box_map),
         "matrix": _matrix(box_map),
-        "paths": [{"name": for_terminal(name)} for name in shown],
+        "paths": [{"name": for_terminal(name)} for name in path_ids],
         "walks": [
-            {"path": shown.index(path.path_id), "rows": _packed(np.column_stack([path.time_s, path.positions_m]))}
+            {"path": path_ids.index(path.path_id), "rows": _packed(np.column_stack([path.time_s, path.positions_m]))}
             for path in pedestrians
-            if path.path_id in shown
+            if path.path_id in path_ids
         ],
-    }
-    notes += _add_pictures(tracks, picture_px)
-    content["tracks"] = [
-        {
-            "path": shown.index(track.path), "kind": for_terminal(track.kind), "rows": _packed(track.rows),
-            "figures": track.figures, "pictures": track.pictures,
-        }
-        for track in tracks
-    ]  # fmt: skip
+        "tracks": [
+            {
+                "path": path_ids.index(track.path), "kind": for_terminal(track.kind), "rows": _packed(track.rows),
+                "figures": track.figures, "pictures": track.pictures,
+            }
+            for track in tracks
+        ],
+    }  # fmt: skip
     script = scripts("tools.js", "canvas.js", "space.js", "scene.js")
     style = scripts("scene.css")
     values: dict[str, Any] = {"title": box_map.name, "notes": notes, "data": content}
@@ -133,15 +133,16 @@ def _boxes(box_map: BoxMap) -> dict[str, Any]:
     centers[is_ground, 2] += lift_m[box_map.kinds[is_ground]]
     rows = np.hstack([centers, axes.transpose(0, 2, 1).reshape(-1, 9)])[order]
     kinds, firsts, counts = np.unique(box_map.kinds[order], return_index=True, return_counts=True)
+    names = [KIND_NAMES[kind] for kind in kinds.tolist()]
     low, high = box_map.bounds()
     return {
         "boxes": _packed(rows),
         "kinds": [
             {
-                "name": (name := KIND_NAMES[int(kinds[k])]), "first": int(firsts[k]), "count": int(counts[k]),
-                "color": COLORS.get(name, OTHER_COLOR), "opacity": OPACITIES.get(name, 1.0),
+                "name": names[k], "first": int(firsts[k]), "count": int(counts[k]),
+                "color": COLORS.get(names[k], OTHER_COLOR), "opacity": OPACITIES.get(names[k], 1.0),
             }
-            for k in np.argsort(firsts)
+            for k in np.argsort(firsts).tolist()
         ],
         "bounds": [low.tolist(), high.tolist()],
     }  # fmt: skip
@@ -162,9 +163,10 @@ def _matrix(box_map: BoxMap) -> dict[str, Any] | None:
 
 def _add_pictures(tracks: Sequence[PageTrack], picture_px: int) -> list[str]:
     """Add pictures to the tracks of a tree; return a note if some frames have none."""
-    shown = [(track, track.drawn, i) for track in tracks if track.drawn is not None for i in range(len(track.drawn))]
-    for track, drawn, index in (shown[k] for k in spread(len(shown), MOST_PICTURES)):
-        if picture := page_pictures({"rgb": partial(read_rgb, drawn.frame_folder(index))}, picture_px):
-            track.pictures[index] = picture["rgb"]
+    frames = [(track, track.drawn, i) for track in tracks if track.drawn is not None for i in range(len(track.drawn))]
+    for k in spread(len(frames), MOST_PICTURES):
+        track, drawn, i = frames[k]
+        if picture := page_pictures({"rgb": partial(read_rgb, drawn.frame_folder(i))}, picture_px):
+            track.pictures[i] = picture["rgb"]
     num_pictures = sum(len(track.pictures) for track in tracks)
-    return [f"{num_pictures:,} of {len(shown):,} frames have pictures"] if num_pictures < len(shown) else []
+    return [f"{num_pictures:,} of {len(frames):,} frames have pictures"] if num_pictures < len(frames) else []

@@ -13,7 +13,7 @@ import numpy as np
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KIND_NAMES, KINDS
-from cosfly.simulators.conventions import CM_PER_M, FAR_CM, unreal_pose
+from cosfly.simulators.conventions import CM_PER_M, FAR_UNITS, unreal_pose
 from simulators.scene import Mover, Server, listen, send
 
 MAGIC = 0x9E2B83C1  # before each message, with its length
@@ -96,7 +96,7 @@ class UnrealCvServer(Server):
         pose = [x / CM_PER_M, y / CM_PER_M, z / CM_PER_M, *turn]
         frame, owners = self.draw((width, height), float(self._camera["fov"]), pose)
         if what == "depth":  # z-depth in centimetres, rounded to half precision
-            buffer, depth_cm = io.BytesIO(), np.minimum(frame.depth * CM_PER_M, FAR_CM)
+            buffer, depth_cm = io.BytesIO(), np.minimum(frame.depth * CM_PER_M, FAR_UNITS)
             np.save(buffer, depth_cm.astype(np.float16).astype(np.float32), allow_pickle=False)
             return buffer.getvalue()
         picture = frame.rgb

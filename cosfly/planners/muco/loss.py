@@ -13,7 +13,7 @@ import numpy as np
 from cosfly.geometry import kernels
 from cosfly.geometry.kernels import RAY_OFFSETS_M, RAY_SPREAD_M, collect_hits, in_box_frame, nearest_box, normal_of_box
 from cosfly.planners.muco.nearby import Nearby, hits_among, nearest_among, nothing_nearby, num_cached, remember
-from cosfly.runtime.compiled import int64, njit
+from cosfly.runtime.compiled import njit
 
 # --- difference window: visibility from a waypoint and its neighbours half a metre away -------------------------------
 
@@ -26,12 +26,15 @@ def window_rays(rows, boxes, num_boxes, x, y, z, step_m, tx, ty, tz, free):
     but each of the twelve ends of the rays is converted to the frame of a box only once.
     """
     blocked = np.zeros((7, 5), dtype=np.bool_)
-    ends, feet = np.empty((7, 3)), np.empty((5, 3))
+    ends, feet = np.empty((7, 3)), np.empty((5, 3))  # of the rays: at the window, and at the target
     for k in range(num_boxes):
         box = boxes[k]
         for place in range(7):
-            shift, axis = step_m * (2 * (place % 2 == 0) - 1), (place - 1) // 2  # -1: the middle
-            u, v, w = (x + shift if axis == 0 else x), (y + shift if axis == 1 else y), (z + shift if axis == 2 else z)
+            axis = (place - 1) // 2  # -1 for the middle
+            shift = step_m if place % 2 == 0 else -step_m
+            u = x + shift if axis == 0 else x
+            v = y + shift if axis == 1 else y
+            w = z + shift if axis == 2 else z
             ends[place, 0], ends[place, 1], ends[place, 2] = in_box_frame(rows, box, u, v, w)
         for ray in range(5):
             feet[ray, 0], feet[ray, 1], feet[ray, 2] = in_box_frame(
@@ -77,14 +80,14 @@ class Problem(NamedTuple):
     bearing_weight: float  # of the azimuth of the view
     altitude_weights: np.ndarray  # (4,) below the least, above the preferred, oscillation, beneath the preferred
     pitches_rad: np.ndarray  # (n, 3) lower edge of the band, preferred, upper edge
-    influence_m: float
-    difference_m: float
-    pitch_weight: float
-    safety_m: float
-    floor_m: float
-    step_max_m: float
-    pushes_max: int
-    dt_s: float
+    influence_m: float  # obstacles nearer than this add to the safety term
+    difference_m: float  # half width of the difference window
+    pitch_weight: float  # of pitch outside the band
+    safety_m: float  # nominal distance to obstacles
+    floor_m: float  # distance to obstacles where the nominal one is impossible
+    step_max_m: float  # between two waypoints
+    pushes_max: int  # out of obstacles, per waypoint and projection
+    dt_s: float  # between two waypoints
 
 
 class State(NamedTuple):
@@ -93,7 +96,7 @@ class State(NamedTuple):
     terms: np.ndarray  # (9,) the loss by term
     gradient: np.ndarray  # (n, 3), without the gradient of visibility
     visibility_gradient: np.ndarray  # (n, 3)
-    band: np.ndarray  # (BAND_ROWS, 3 n) the lower band of the curvature
+    band: np.ndarray  # (BAND_ROWS, 3 n) lower band of the curvature H: band[k, j] = H[j + k, j], j = 3 waypoint + axis
     visibility: np.ndarray  # (n,) five-ray visibility
     rough: np.ndarray  # (n,) share of each waypoint in the terms that are not smooth: visibility and safety
     blockers: np.ndarray  # (k,) buffer of box numbers
@@ -132,9 +135,9 @@ def evaluate(points, problem, index, masked, state):
     state.contacts.fill(0.0)
     state.rough.fill(0.0)
     chain_curvature(problem, state)
-    point_terms(points, int64(0), len(points), problem, index, masked, state)
+    point_terms(points, problem, index, masked, state)
     visibility_terms(points, problem, index, masked, state)
-    chain_terms(points, int64(0), len(points), problem, state)
+    chain_terms(points, problem, state)
     return state.terms.sum()
 
 
@@ -162,25 +165,30 @@ def _add_square(terms, gradient, band, term, i, weight, residual, ax, ay, az, in
 
 
 @njit(cache=True)
-def point_terms(points, begin, end, problem, index, masked, state):
-    """Add tracking, safety, view angle, altitude bounds and pitch band of waypoints [begin, end)."""
+def point_terms(points, problem, index, masked, state):
+    """Add tracking, safety, view angle, altitude bounds and pitch band."""
     terms, gradient, band, rough, contacts = state.terms, state.gradient, state.band, state.rough, state.contacts
     anchors, around, num_around, rows = state.nearby.anchors, state.nearby.around, state.nearby.num_around, index.rows
     targets, views, weights = problem.targets, problem.views_rad, problem.weights
     distances, pitches = problem.distances, problem.pitches_rad
-    bearing_weight, beneath = problem.bearing_weight, problem.altitude_weights[BENEATH]
-    influence, half_safety = problem.influence_m, 0.5 * weights[SAFETY]
+    bearing_weight = problem.bearing_weight
+    influence = problem.influence_m
+    half_safety = 0.5 * weights[SAFETY]
     below, above = problem.altitude_weights[BELOW], problem.altitude_weights[ABOVE]
-    for i in range(begin, end):
+    beneath = problem.altitude_weights[BENEATH]
+    for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        low, high = problem.altitudes[i, LEAST], problem.altitudes[i, PREFERRED]
+        least_z, preferred_z = problem.altitudes[i, LEAST], problem.altitudes[i, PREFERRED]
         dx, dy, dz = x - targets[i, 0], y - targets[i, 1], z - targets[i, 2]
+
+        # Tracking: deviation of the slant distance.
         distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
         ax, ay, az = dx / distance, dy / distance, dz / distance
         excess = distance - distances[i]
         _add_square(terms, gradient, band, TRACKING, i, weights[TRACKING], excess, ax, ay, az, True)
 
-        count = num_cached(anchors, num_around, i, x, y, z)
+        # Safety: intrusion into the influence distance of the nearest box, along its normal.
+        count = num_cached(anchors, num_around, i, x, y, z)  # -1: unknown, ask the index; 0: no box is near
         if count != 0:
             if count > 0:
                 gap, box = nearest_among(rows, around, i, count, x, y, z, influence)
@@ -197,7 +205,8 @@ def point_terms(points, begin, end, problem, index, masked, state):
         # of the view's azimuth from the heading. Straight above the target both are undefined: a floor of one metre
         # keeps their derivatives finite.
         flat = max(np.sqrt(dx * dx + dy * dy), 1.0)
-        pitch, square = np.arctan2(dz, flat), flat * flat + dz * dz
+        pitch = np.arctan2(dz, flat)
+        square = flat * flat + dz * dz
         px, py, pz = -dz * dx / flat / square, -dz * dy / flat / square, flat / square
         off = pitch - pitches[i, PREFERRED_PITCH]
         is_free = not masked[i]
@@ -210,12 +219,13 @@ def point_terms(points, begin, end, problem, index, masked, state):
         if outside != 0.0:
             _add_square(terms, gradient, band, PITCH, i, problem.pitch_weight, outside, px, py, pz, True)
 
-        if z < low:
-            _add_square(terms, gradient, band, ALTITUDE, i, below, low - z, 0.0, 0.0, -1.0, True)
-        if z > high:
-            _add_square(terms, gradient, band, ALTITUDE, i, above, z - high, 0.0, 0.0, 1.0, True)
+        # Altitude: below the least, above the preferred, and for styles also beneath the preferred.
+        if z < least_z:
+            _add_square(terms, gradient, band, ALTITUDE, i, below, least_z - z, 0.0, 0.0, -1.0, True)
+        if z > preferred_z:
+            _add_square(terms, gradient, band, ALTITUDE, i, above, z - preferred_z, 0.0, 0.0, 1.0, True)
         elif beneath > 0.0:
-            _add_square(terms, gradient, band, ALTITUDE, i, beneath, high - z, 0.0, 0.0, -1.0, True)
+            _add_square(terms, gradient, band, ALTITUDE, i, beneath, preferred_z - z, 0.0, 0.0, -1.0, True)
 
 
 @njit(cache=True)
@@ -231,7 +241,8 @@ def visibility_terms(points, problem, index, masked, state):
     free = np.empty(7)
     visible, blockers, band, rough, rows = state.visibility, state.blockers, state.band, state.rough, index.rows
     anchors, on_view, num_on_view = state.nearby.anchors, state.nearby.on_view, state.nearby.num_on_view
-    slope, slopes, targets = np.empty(3), state.visibility_gradient, problem.targets
+    gradient, targets = state.visibility_gradient, problem.targets
+    slope = np.empty(3)  # of the visible share, per m
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         visible[i] = 1.0
@@ -254,7 +265,7 @@ def visibility_terms(points, problem, index, masked, state):
             continue
         for axis in range(3):
             slope[axis] = (free[1 + 2 * axis] - free[2 + 2 * axis]) / (2.0 * step)
-            slopes[i, axis] = 2.0 * weight * hidden * slope[axis]
+            gradient[i, axis] = 2.0 * weight * hidden * slope[axis]
         for a in range(3):
             for b in range(a + 1):
                 band[a - b, 3 * i + b] += 2.0 * weight * slope[a] * slope[b]
@@ -285,15 +296,15 @@ def chain_curvature(problem, state):
 
 
 @njit(cache=True)
-def chain_terms(points, begin, end, problem, state):
-    """Add smoothness, jerk, path length and altitude oscillation of the differences that start in [begin, end).
+def chain_terms(points, problem, state):
+    """Add smoothness, jerk, path length and altitude oscillation.
 
     Adds to terms and gradient, and the path length's curvature to the band; the rest is `chain_curvature`.
     """
     num_points, weights, gradient = len(points), problem.weights, state.gradient
     smoothness, jerk, swing = weights[SMOOTHNESS], weights[JERK], problem.altitude_weights[SWING]
     bends, jerks, swings = 0.0, 0.0, 0.0
-    for i in range(max(begin, 0), min(end, num_points - 1)):
+    for i in range(num_points - 1):
         for axis in range(3):
             p, q = points[i, axis], points[i + 1, axis]
             if i + 2 < num_points:
@@ -318,16 +329,16 @@ def chain_terms(points, begin, end, problem, state):
     state.terms[SMOOTHNESS] += smoothness * bends
     state.terms[JERK] += jerk * jerks
     state.terms[ALTITUDE] += swing * swings
-    _add_lengths(points, max(begin, 0), min(end, num_points - 1), 0.1 * weights[PATH_LENGTH], state)
+    _add_lengths(points, 0.1 * weights[PATH_LENGTH], state)
 
 
 @njit(cache=True)
-def _add_lengths(points, begin, end, weight, state):
+def _add_lengths(points, weight, state):
     """Add weight * |p_{i+1} - p_i|; its curvature is (1 - u u^T) / length, with a floor under the length."""
     gradient, band = state.gradient, state.band
     unit = np.empty(3)
     total = 0.0
-    for i in range(begin, end):
+    for i in range(len(points) - 1):
         for a in range(3):
             unit[a] = points[i + 1, a] - points[i, a]
         length = np.sqrt(unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2])

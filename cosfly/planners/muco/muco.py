@@ -61,9 +61,10 @@ def search_start(
     climbs = np.maximum(rings[0, :, 1] - preferred_m[0], 0.0)[:, None] / CLIMB_SCALE_M
     turn_cost = TURN_COST if reference.any_bearing else TURN_COST_OF_STYLES
     costs = turn_cost * turns[None] ** 2 + CLIMB_COST * climbs + STEEP_COST * (np.arange(rings.shape[1]) > 0)[:, None]
-    targets_m, times_s, keeps_sight = problem.targets[keys], keys * problem.dt_s, reference.keeps_sight[keys]
-    limit_mps = SPEED_SHARE * cfg.speed_max_mps
-    chosen = _search(places_m, targets_m, times_s, costs, keeps_sight, index, clearance_m, limit_mps)
+    chosen = _search(
+        places_m, problem.targets[keys], keys * problem.dt_s, costs, reference.keeps_sight[keys], index, clearance_m,
+        SPEED_SHARE * cfg.speed_max_mps,
+    )  # fmt: skip
     return None if chosen[0] < 0 else scenario.between(keys, places_m[np.arange(len(keys)), chosen])
 
 
@@ -81,16 +82,16 @@ def _rings(distances_m: np.ndarray, preferred_m: np.ndarray, greatest_m: np.ndar
 def _search(places, targets, times_s, costs, keeps_sight, index, clearance_m, limit_mps):
     """Return the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
 
-    places: (m, c, 3), c = rings * azimuths.
-    targets: (m, 3).
-    times_s: (m,).
-    costs: (rings, azimuths) of a place apart from visibility.
-    keeps_sight: (m,) bool, whether visibility counts.
+    Args:
+        places: (m, c, 3), c = rings * azimuths. targets: (m, 3). times_s: (m,).
+        costs: (rings, azimuths) of a place apart from visibility.
+        keeps_sight: (m,) bool, whether visibility counts.
     """
     num_keys, num_places = len(places), places.shape[1]
     way_costs = np.full((num_keys, num_places), np.inf)
     came_from = np.full((num_keys, num_places), -1, dtype=np.int64)
-    blockers, guesses = np.empty(len(index.rows), dtype=np.int64), np.empty(num_places)
+    blockers = np.empty(len(index.rows), dtype=np.int64)
+    guesses = np.empty(num_places)
     for key in range(num_keys):
         place_costs = _place_costs(places[key], targets[key], costs, keeps_sight[key], index, clearance_m, blockers)
         if key == 0:
@@ -149,8 +150,11 @@ def _cheapest_predecessor(places, c, previous, way_costs, step_s, index, clearan
         guesses[before] = np.inf
 
 
+# --- planner ----------------------------------------------------------------------------------------------------------
+
 # Reasons to stop that count as converged. If no step of any length lowers the loss, its change is 0.
 CONVERGED_REASONS = ("converged", "no_step", "no_interior_waypoint")
+ROUNDINGS_S = (3.0, 1.5, 0.75)  # standard deviations of the smoothing of a searched start, tried in this order
 
 
 def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
@@ -211,7 +215,7 @@ def start_trajectory(
 
 def _rounded_off(points: np.ndarray, problem: Problem, obstacles: BoxIndex) -> np.ndarray:
     """Smooth the corners of a searched trajectory, (n, 3), as far as it stays feasible; saves many capped steps."""
-    for smoothing_s in (3.0, 1.5, 0.75):
+    for smoothing_s in ROUNDINGS_S:
         smooth = gaussian_filter1d(points, smoothing_s / problem.dt_s, axis=0, mode="nearest")
         if project(smooth, problem, obstacles, 0, len(smooth), nothing_nearby(len(smooth))):
             return smooth

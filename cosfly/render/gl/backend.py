@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 import weakref
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.weather import WeatherParams
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Frame, PosedPeople, PosedPerson, check_pose, far_as_sky
 from cosfly.render.gl import meshes, programs
-from cosfly.render.gl.parts import DRAW_ORDER, NEVER_PX, NUM_MATERIALS, PART, CameraView, materials_of
+from cosfly.render.gl.parts import DRAW_ORDER, NEVER_PX, NUM_MATERIALS, PART, CameraView, Parts, materials_of
 from cosfly.render.gl.people import CAPSULE_M, PERSON_RADIUS_M, PersonParts, person_parts, shadow_corners
 from cosfly.render.gl.programs import LooseBuffers, Programs, set_uniform
 from cosfly.render.gl.scene import build_scene
@@ -44,10 +44,28 @@ PATTERN_M = 720.0  # common multiple of the patterns' sizes: the scene's origin 
 ORIGIN_STEP_M = 2.0 * PATTERN_M  # a trajectory farther off than half of this has an origin of its own
 
 
+class _WeatherPrograms(NamedTuple):
+    """What draws one kind of weather."""
+
+    programs: Programs
+    sky: Any  # vertex array of a triangle over the picture
+    shadow: Any  # the same, for the shadow of one person
+    weather: WeatherPass | None  # None in fair weather
+
+
 class GlRenderer:
-    """A renderer on EGL. One object holds one GL context and belongs to the thread that made it."""
+    """A renderer on EGL. One object holds one GL context and belongs to the thread that made it.
+
+    Positions whose names do not end in _m are relative to `origin_m`, in m.
+    """
 
     dresses = True
+    # Set by `prepare`:
+    origin_m: np.ndarray  # (3,) world
+    _parts: Parts  # those that a camera of the trajectory can see
+    _part_groups: np.ndarray  # (k,) of `_parts`, as `_groups` returns them
+    _sun: np.ndarray  # (3,) unit vector towards the sun
+    _area: dict[str, Any]  # uniforms of the shadow map and the height map
 
     def __init__(self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0) -> None:
         self.context = programs.open_context()
@@ -78,7 +96,7 @@ class GlRenderer:
             self._arrays: dict[tuple[int, int], tuple[Any, Any]] = {}  # made when needed
             texts = programs.sources(("part.glsl", "depth.vert.glsl"), ("depth.frag.glsl",))
             self._depth_program = context.program(*texts)
-            self._looks: dict[str | None, tuple[Programs, Any, Any, WeatherPass | None]] = {}
+            self._by_weather: dict[str | None, _WeatherPrograms] = {}
             self._use_weather(None)
         self._open_map(box_map)
         self.prepare(*self.scene.bounds())
@@ -90,7 +108,7 @@ class GlRenderer:
         """
         other = copy.copy(self)
         other._opened_by = self  # whose end releases the context
-        other._looks = {None: self._looks[None]}  # the others are prepared for a map
+        other._by_weather = {None: self._by_weather[None]}  # the others are prepared for a map
         other._open_map(box_map)
         return other
 
@@ -107,18 +125,18 @@ class GlRenderer:
             self._height.filter = (context.NEAREST, context.NEAREST)  # it is smooth already, and this is faster
             for texture in (self._shadow, self._height):
                 texture.repeat_x = texture.repeat_y = False
-        self._area: dict[str, Any] = {}  # uniforms of the shadow map and the height map, made by `prepare`
+        self._area = {}
 
     def _use_weather(self, define: str | None) -> None:
         """Switch to the programs of fair weather (None), or of a weather with these defines."""
-        if define not in self._looks:
+        if define not in self._by_weather:
             compiled = programs.programs_of(self.context, define, snaps=not self._is_software)
             weather = None
             if define is not None:
                 weather = WeatherPass(self.context, self._over_color, self._depth, compiled.rain)
-            triangles = (self.context.vertex_array(program, []) for program in (compiled.sky, compiled.shadow))
-            self._looks[define] = compiled, *triangles, weather
-        self._programs, self._sky, self._shadow_triangle, self._weather = self._looks[define]
+            sky, shadow = (self.context.vertex_array(program, []) for program in (compiled.sky, compiled.shadow))
+            self._by_weather[define] = _WeatherPrograms(compiled, sky, shadow, weather)
+        self._programs, self._sky, self._shadow_triangle, self._weather = self._by_weather[define]
 
     def _array(self, program: Any, mesh: int) -> tuple[Any, Any]:
         """Return vertex array and instance buffer of a program for a mesh."""
@@ -140,7 +158,8 @@ class GlRenderer:
         """Compute sun shadows and sky openness for an area of the world, (3,) corners, and set the weather."""
         low_m, high_m = np.asarray(low_m), np.asarray(high_m)
         self._select_parts(low_m, high_m)
-        low, high = low_m - self.origin_m, high_m - self.origin_m
+        low = low_m - self.origin_m
+        high = high_m - self.origin_m
         middle = (low + high) / 2.0
         half_m = float(np.clip((high - low)[:2].max(), SMALLEST_SHADOW_AREA_M, LARGEST_SHADOW_AREA_M)) / 2.0
         shift_m = self.origin_m - self.scene.origin_m
@@ -175,7 +194,7 @@ class GlRenderer:
         outside_m = np.maximum(low_m - zero_m - parts.object_centers, parts.object_centers - (high_m - zero_m))
         away_m = np.linalg.norm(np.maximum(outside_m, 0.0), axis=1) - parts.object_radii
         shift_m = np.round(((low_m + high_m) / 2.0 - zero_m) / ORIGIN_STEP_M) * [1.0, 1.0, 0.0] * ORIGIN_STEP_M
-        self.origin_m = zero_m + shift_m  # (3,) world; positions that do not end in _m are relative to it, in m
+        self.origin_m = zero_m + shift_m
         self._parts = parts.select(away_m < FAR_M).relative_to(shift_m)
         self._part_groups = _groups(self._parts.records, self._parts.mesh)
 
@@ -354,7 +373,8 @@ class GlRenderer:
         self._image.read_into(depth, components=1, attachment=1, dtype="f4")
         self._image.read_into(tag, components=1, attachment=2, dtype="u4")
         rgb = smoothed(cv2.cvtColor(color, cv2.COLOR_RGBA2RGB))
-        rgb = rgb if self._weather is None else self._weather.glowing(rgb)
+        if self._weather is not None:
+            rgb = self._weather.glowing(rgb)
         return far_as_sky(Frame(rgb, depth, (tag & 0xFF).astype(np.uint8), (tag >> 16).astype(np.uint16)))
 
     def close(self) -> None:

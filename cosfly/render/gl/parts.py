@@ -63,10 +63,10 @@ class Parts:
 
     @staticmethod
     def concatenate(parts: list[Parts]) -> Parts:
-        return Parts(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
+        return Parts(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
 
     def select(self, keep: np.ndarray) -> Parts:
-        return Parts(*(column[keep] for column in vars(self).values()))
+        return Parts(**{name: column[keep] for name, column in vars(self).items()})
 
     def relative_to(self, origin_m: np.ndarray) -> Parts:
         """Return the same parts relative to a further origin, (3,): float32 is most precise near 0."""

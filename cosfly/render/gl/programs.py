@@ -34,11 +34,12 @@ def open_context() -> Any:
 
 
 def sources(vertex: tuple[str, ...], fragment: tuple[str, ...], define: str = "") -> tuple[str, str]:
-    """Return the texts of a program of these files."""
-    folder = Path(__file__).parent
-    head = "#version 330 core\n" + define
-    texts = ["\n".join(read_text(folder / name) for name in names) for names in (vertex, fragment)]
-    return head + texts[0], head + texts[1]
+    """Return the texts of the vertex and the fragment shader that consist of these files."""
+
+    def text_of(names: tuple[str, ...]) -> str:
+        return "#version 330 core\n" + define + "\n".join(read_text(Path(__file__).parent / name) for name in names)
+
+    return text_of(vertex), text_of(fragment)
 
 
 @dataclass(frozen=True)
@@ -97,16 +98,19 @@ class LooseBuffers:
     def __init__(self, context: Any, loose: LooseTriangles) -> None:
         self._context = context
         self._loose = loose
-        self._buffers = {material: context.buffer(reserve=rows.nbytes) for material, rows in loose.vertices.items()}
-        self._indices = {m: context.buffer(reserve=4 * len(rows), dynamic=True) for m, rows in loose.vertices.items()}
-        numbers = np.arange(len(loose.centers) + 1)
-        self._firsts = {material: 3 * np.searchsorted(rows, numbers) for material, rows in loose.objects.items()}
+        self._buffers: dict[int, Any] = {}  # the following are by material: vertices
+        self._indices: dict[int, Any] = {}  # of the vertices to draw
         self._num_indices: dict[int, int] = {}
-        self._arrays: dict[tuple[int, int], Any] = {}
+        numbers = np.arange(len(loose.centers) + 1)
+        # By material, the first vertex of each object, and their number at the end.
+        self._firsts = {material: 3 * np.searchsorted(objects, numbers) for material, objects in loose.objects.items()}
+        self._arrays: dict[tuple[int, int], Any] = {}  # by program and material
         self.centers = loose.centers.astype(np.float32)
         self.radii = loose.radii.astype(np.float32)
-        for material, rows in loose.vertices.items():
-            self._write(material, np.arange(len(rows)))
+        for material, vertices in loose.vertices.items():
+            self._buffers[material] = context.buffer(reserve=vertices.nbytes)
+            self._indices[material] = context.buffer(reserve=4 * len(vertices), dynamic=True)
+            self._write(material, np.arange(len(vertices)))
 
     def place(self, shift_m: np.ndarray) -> None:
         """Move the origin, (3,) relative to the scene's: float32 is most precise near 0."""
@@ -120,8 +124,9 @@ class LooseBuffers:
         """Select the objects that a camera may see, the nearest first; None selects everything."""
         seen = np.arange(len(self.centers)) if view is None else view.sphere_rows_in_view(self.centers, self.radii)
         for material, firsts in self._firsts.items():
-            counts = (firsts[1:] - firsts[:-1])[seen]
-            before = np.cumsum(counts) - counts
+            counts = np.diff(firsts)[seen]
+            before = np.cumsum(counts) - counts  # vertices of the objects before each
+            # For each object in turn the numbers first, first + 1 ... of its vertices.
             self._write(material, np.repeat(firsts[:-1][seen] - before, counts) + np.arange(counts.sum()))
 
     def _write(self, material: int, indices: np.ndarray) -> None:
@@ -148,8 +153,10 @@ class LooseBuffers:
 
 def attributes(program: Any, buffer: Any, layout: str, names: tuple[str, ...]) -> tuple:
     """Return the buffer layout for a program: attributes that its compiler removed become padding."""
-    kinds = layout.split()
-    suffix = kinds.pop() if kinds[-1].startswith("/") else ""
-    used = [name in program for name in names]
-    padded = [kind if use else f"{4 * int(kind[:-1])}x" for kind, use in zip(kinds, used, strict=True)]
-    return (buffer, " ".join(padded) + suffix, *(name for name, use in zip(names, used, strict=True) if use))
+    formats = layout.split()  # such as 3f, three floats
+    suffix = formats.pop() if formats[-1].startswith("/") else ""
+    used_names = [name for name in names if name in program]
+    padded = [
+        text if name in used_names else f"{4 * int(text[:-1])}x" for name, text in zip(names, formats, strict=True)
+    ]
+    return (buffer, " ".join(padded) + suffix, *used_names)

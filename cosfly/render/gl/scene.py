@@ -17,37 +17,59 @@ from cosfly.render.gl.shapes import BUILDING_COLORS, PLAIN_COLORS, TILE_COLORS, 
 from cosfly.render.surfaces import Solids, are_solids, layers_of, solids_of
 
 # --- solids -----------------------------------------------------------------------------------------------------------
-# The triangles of meshes. Buildings get walls with storeys and windows, flat roofs, and tiles on sloping roofs; meshes
-# with colours of their own get plain paint. The shader draws patterns in the axes of a part, so each plane of a
-# building is a part.
+# The triangles of meshes, each an object. Buildings get walls with storeys and windows, flat roofs, and tiles on
+# sloping roofs; other objects get plain paint. The shader draws patterns in the axes of a part, so each plane of a
+# building is a part; any other object is one part.
 
-OTHER, SLOPE, WALL, FLAT_ROOF = range(4)  # surfaces: those of buildings, and OTHER for all other things
+OTHER, SLOPE, WALL, FLAT_ROOF = range(4)  # surfaces: those of buildings, and OTHER for all other objects
 MATERIAL_OF_SURFACE = np.array([parts.PLAIN, parts.TILES, parts.FACADE, parts.FACADE])
 WALL_Z_MAX = 0.35  # of a wall's normal
 FLAT_ROOF_Z_MIN = 0.94  # of a flat roof's normal
 SAME_ANGLE_RAD, SAME_PLACE_M = np.radians(1.0), 0.1  # surfaces that differ by less are one plane
 NUM_QUARTER_STEPS = round(np.pi / 2 / SAME_ANGLE_RAD)  # steps of SAME_ANGLE_RAD in a quarter turn
 THINNEST_M = 0.01  # half size of a flat part
+SEED_SHARE = 0.999  # of seeds: in the shader, 1 or more asks for the rim of a roof (shapes.HAS_RIM)
 
 
 def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.ndarray) -> LooseTriangles:
     """Return the triangles of solids for the shader, which draws both of their sides.
 
-    ids: (n,) instance ids of the map's boxes.
+    Args:
+        ids: (n,) instance ids of the map's boxes.
     """
     if not len(solids):
         return LooseTriangles({}, {}, np.zeros((0, 3)), np.zeros(0))
-    kinds = box_map.kinds[solids.rows]
-    seeds = seeds_of(box_map.ids[solids.rows])
-    normals = solids.normals
-    steepness = np.abs(normals[:, 2])
-    surfaces = np.where(steepness < WALL_Z_MAX, WALL, np.where(steepness > FLAT_ROOF_Z_MIN, FLAT_ROOF, SLOPE))
-    surfaces[kinds != KINDS["Buildings"]] = OTHER
+    upright = np.abs(solids.normals[:, 2])
+    surfaces = np.where(upright < WALL_Z_MAX, WALL, np.where(upright > FLAT_ROOF_Z_MIN, FLAT_ROOF, SLOPE))
+    surfaces[box_map.kinds[solids.rows] != KINDS["Buildings"]] = OTHER
+    low_m, high_m = _bounds(solids.corners_m, solids.objects)
+    middles_m = (low_m + high_m) / 2.0
+    front_sides = _vertices(box_map, solids, surfaces, middles_m[solids.objects], origin_m, ids)
+    back_sides = front_sides[:, ::-1].copy()
+    back_sides["normal"] *= -1.0
+    vertices = np.concatenate([front_sides, back_sides])
+    materials = np.tile(MATERIAL_OF_SURFACE[surfaces], 2)
+    objects = np.tile(solids.objects, 2)
+    rows_of = {}
+    for material in np.unique(materials).tolist():
+        rows = np.flatnonzero(materials == material)
+        rows_of[material] = rows[np.argsort(objects[rows], kind="stable")]  # both sides of an object are together
+    return LooseTriangles(
+        vertices={material: vertices[rows].reshape(-1) for material, rows in rows_of.items()},
+        objects={material: objects[rows] for material, rows in rows_of.items()},
+        centers=middles_m - origin_m,
+        radii=np.linalg.norm(high_m - low_m, axis=1) / 2.0,
+    )
+
+
+def _vertices(
+    box_map: BoxMap, solids: Solids, surfaces: np.ndarray, middles_m: np.ndarray, origin_m: np.ndarray, ids: np.ndarray
+) -> np.ndarray:
+    """Return the vertices of the triangles, (k, 3) LOOSE_VERTEX; middles_m: (k, 3) of the object of each triangle."""
     materials = MATERIAL_OF_SURFACE[surfaces]
+    seeds = seeds_of(box_map.ids[solids.rows])
     axes, part_numbers = _planes(box_map, solids, surfaces)
-    low_m, high_m = _bounds(solids.corners_m, solids.things)
-    middles_m = (low_m + high_m)[solids.things] / 2.0
-    # Corners in the axes of their part, from the middle of their thing; center and half: bounds of the parts there.
+    # Corners in the axes of their part, from the middle of their object; center and half: bounds of the parts there.
     local_m = np.einsum("kij,kcj->kci", axes, solids.corners_m - middles_m[:, None])
     part_low_m, part_high_m = (bound[part_numbers] for bound in _bounds(local_m, part_numbers))
     centers_m = (part_low_m + part_high_m) / 2.0
@@ -56,29 +78,16 @@ def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.
     # The shader scales `position` by `half`, so positions lie within -1 to 1. Normals scale inversely.
     vertices["position"] = (local_m - centers_m[:, None]) / halves_m[:, None]
     for name, values in {
-        "normal": np.einsum("kij,kj->ki", axes, normals) * halves_m,
+        "normal": np.einsum("kij,kj->ki", axes, solids.normals) * halves_m,
         "center": np.einsum("kji,kj->ki", axes, centers_m) + middles_m - origin_m,
         "half": halves_m,
         "quaternion": Rotation.from_matrix(axes.transpose(0, 2, 1)).as_quat(),
-        "color": np.column_stack([_painted(materials, seeds), seeds * 0.999]),
-        "tag": parts.tags(kinds, materials, ids[solids.rows]),
+        "color": np.column_stack([_painted(materials, seeds), seeds * SEED_SHARE]),
+        "tag": parts.tags(box_map.kinds[solids.rows], materials, ids[solids.rows]),
     }.items():
         vertices[name] = values[:, None]
     vertices["bias"] = LAYER_STEP * STANDING_LAYER
-    back_sides = vertices[:, ::-1].copy()
-    back_sides["normal"] *= -1.0
-    vertices = np.concatenate([vertices, back_sides])
-    materials, things = np.tile(materials, 2), np.tile(solids.things, 2)
-    rows_of = {}
-    for material in np.unique(materials).tolist():
-        rows = np.flatnonzero(materials == material)
-        rows_of[material] = rows[np.argsort(things[rows], kind="stable")]  # both sides of a thing are together
-    return LooseTriangles(
-        {material: vertices[rows].reshape(-1) for material, rows in rows_of.items()},
-        {material: things[rows] for material, rows in rows_of.items()},
-        (low_m + high_m) / 2.0 - origin_m,
-        np.linalg.norm(high_m - low_m, axis=1) / 2.0,
-    )
+    return vertices
 
 
 def _bounds(corners_m: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -102,20 +111,25 @@ def _painted(materials: np.ndarray, seeds: np.ndarray) -> np.ndarray:
 def _planes(box_map: BoxMap, solids: Solids, surfaces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the axes of the part of each triangle, (k, 3, 3) part_from_world, and the number of that part, (k,).
 
-    Axes of a wall: x along it, y out, z up. Of a slope: x along its eaves, y out, z up the slope. Of a flat roof: those
-    of the main direction of its house's walls, z up. Of other things: those of the box.
+    Axes by surface:
+        wall: x along it, y out, z up
+        slope: x along its eaves, y out, z up the slope
+        flat roof: those of the main direction of its house's walls, z up
+        other: those of the box
     """
     normals = solids.normals
     # Directions of normals in whole steps of SAME_ANGLE_RAD: equal numbers are one direction.
     yaw_steps = np.round(np.arctan2(normals[:, 1], normals[:, 0]) / SAME_ANGLE_RAD).astype(np.int64)
     tilt_steps = np.round(np.arcsin(np.clip(normals[:, 2], -1.0, 1.0)) / SAME_ANGLE_RAD).astype(np.int64)
     tilt_steps[surfaces == WALL] = 0
-    yaws_rad, tilts_rad = yaw_steps * SAME_ANGLE_RAD, tilt_steps * SAME_ANGLE_RAD
+    yaws_rad = yaw_steps * SAME_ANGLE_RAD
+    tilts_rad = tilt_steps * SAME_ANGLE_RAD
     sine, cosine = np.sin(yaws_rad), np.cos(yaws_rad)
     out = np.stack([cosine * np.cos(tilts_rad), sine * np.cos(tilts_rad), np.sin(tilts_rad)], axis=1)
     along = np.stack([sine, -cosine, np.zeros_like(sine)], axis=1)
     axes = np.stack([along, out, np.cross(along, out)], axis=1)
-    is_flat, is_other = surfaces == FLAT_ROOF, surfaces == OTHER
+    is_flat = surfaces == FLAT_ROOF
+    is_other = surfaces == OTHER
     axes[is_flat] = _main_axes(solids, surfaces == WALL, yaw_steps)[is_flat]
     box_axes = rotation_matrices(np.radians(box_map.rotations_deg[solids.rows])).transpose(0, 2, 1)
     axes[is_other] = box_axes[is_other]
@@ -123,9 +137,9 @@ def _planes(box_map: BoxMap, solids: Solids, surfaces: np.ndarray) -> tuple[np.n
     # Distance of the plane from the origin. A flat roof counts by its height, since it is not quite level.
     away_m = np.where(is_flat, middles_m[:, 2], np.einsum("kj,kj->k", out, middles_m))
     away_steps = np.round(away_m / SAME_PLACE_M).astype(np.int64)
-    key = np.stack([solids.things, surfaces, yaw_steps, tilt_steps, away_steps], axis=1)
+    key = np.stack([solids.objects, surfaces, yaw_steps, tilt_steps, away_steps], axis=1)
     key[is_flat, 2:4] = 0  # all directions of a flat roof are one
-    key[is_other, 2:] = 0  # any other thing is one part
+    key[is_other, 2:] = 0  # any other object is one part
     return axes, np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
 
 
@@ -133,9 +147,9 @@ def _main_axes(solids: Solids, is_wall: np.ndarray, yaw_steps: np.ndarray) -> np
     """Return level axes along the walls of each triangle's house, by the direction of most wall area, (k, 3, 3)."""
     edges = solids.corners_m[:, 1:] - solids.corners_m[:, :1]
     wall_areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) * is_wall  # twice the areas
-    areas = np.zeros((int(solids.things[-1]) + 1, NUM_QUARTER_STEPS))  # walls at right angles have one direction
-    np.add.at(areas, (solids.things, yaw_steps % NUM_QUARTER_STEPS), wall_areas)
-    yaws_rad = areas.argmax(axis=1)[solids.things] * SAME_ANGLE_RAD
+    areas = np.zeros((int(solids.objects[-1]) + 1, NUM_QUARTER_STEPS))  # walls at right angles have one direction
+    np.add.at(areas, (solids.objects, yaw_steps % NUM_QUARTER_STEPS), wall_areas)
+    yaws_rad = areas.argmax(axis=1)[solids.objects] * SAME_ANGLE_RAD
     sine, cosine, zero = np.sin(yaws_rad), np.cos(yaws_rad), np.zeros(len(solids))
     return np.stack([cosine, sine, zero, -sine, cosine, zero, zero, zero, zero + 1.0], axis=1).reshape(-1, 3, 3)
 
@@ -158,17 +172,17 @@ def lamps_along_streets(box_map: BoxMap) -> np.ndarray:
     lamps = [np.zeros((0, 3))]
     for row in np.lexsort((streets.ids, -half[:, 0] * half[:, 1])):
         along, across = (0, 1) if half[row, 0] >= half[row, 1] else (1, 0)
-        steps = np.arange(max(1, round(2.0 * half[row, along] / ALONG_M)))
-        local = np.zeros((len(steps), 3))
-        local[:, along] = half[row, along] * ((2.0 * steps + 1.0) / len(steps) - 1.0)
-        local[:, across] = np.where(steps % 2, 1.0, -1.0) * max(half[row, across] - FROM_EDGE_M, 0.0)
+        k = np.arange(max(1, round(2.0 * half[row, along] / ALONG_M)))
+        local = np.zeros((len(k), 3))
+        local[:, along] = half[row, along] * ((2.0 * k + 1.0) / len(k) - 1.0)
+        local[:, across] = np.where(k % 2, 1.0, -1.0) * max(half[row, across] - FROM_EDGE_M, 0.0)  # alternating sides
         lamps.append(streets.centers[row] + local @ turns[row].T)
     places = np.concatenate(lamps)
-    stays = np.ones(len(places), bool)
-    pairs = cKDTree(places[:, :2]).query_pairs(APART_M, output_type="ndarray") if len(places) else []
-    for first, second in sorted(map(tuple, pairs)):
-        stays[second] &= not stays[first]
-    places = places[stays]
+    is_kept = np.ones(len(places), bool)
+    near_pairs = cKDTree(places[:, :2]).query_pairs(APART_M, output_type="ndarray") if len(places) else []
+    for first, second in sorted(map(tuple, near_pairs)):
+        is_kept[second] &= not is_kept[first]
+    places = places[is_kept]
     places[:, 2] = np.maximum(places[:, 2], box_map.ground_z_m) + HIGH_M
     return places
 
@@ -176,6 +190,7 @@ def lamps_along_streets(box_map: BoxMap) -> np.ndarray:
 # --- scenes -----------------------------------------------------------------------------------------------------------
 
 HAS_PAINT = 2.0  # seed of a road on a map with its own lane markings; the shader draws none on it
+PLANE_COLOR = (0.105, 0.14, 0.045)
 
 
 @dataclass(frozen=True)
@@ -199,25 +214,26 @@ def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
     """Convert a map to drawable parts, with a ground plane under everything."""
     origin = contract.scene_origin(box_map)
     all_ids = contract.instance_ids(box_map, num_others)
-    are_meshes = are_solids(box_map)
+    has_mesh = are_solids(box_map)
     all_parts = list[Parts]()
     centers = box_map.centers - origin
     tiers = layers_of(box_map) % 1.0
     seeds = seeds_of(box_map.ids)
     turns = rotation_matrices(np.radians(box_map.rotations_deg))
-    half = np.maximum(box_map.half_extents, 1e-3)
+    half = np.maximum(box_map.half_extents, parts.LEAST_HALF_M)
     if (box_map.kinds == KINDS["RoadLines"]).any():
         seeds[box_map.kinds == KINDS["Roads"]] = HAS_PAINT
-    for kind in np.unique(box_map.kinds[~are_meshes]).tolist():
-        rows = np.flatnonzero((box_map.kinds == kind) & ~are_meshes)
+    for kind in np.unique(box_map.kinds[~has_mesh]).tolist():
+        rows = np.flatnonzero((box_map.kinds == kind) & ~has_mesh)
         boxes = Boxes(centers[rows], half[rows], turns[rows], all_ids[rows], seeds[rows], kind, tiers[rows])
         all_parts += parts_of(boxes)
-    center, half_m = contract.ground_plane(box_map)
-    ids = np.full(1, NO_INSTANCE, np.uint16)
-    zero = np.zeros(1)  # seed and tier
-    plane = Boxes((center - origin)[None], half_m[None], np.eye(3)[None], ids, zero, KINDS["Terrain"], zero)
-    all_parts.append(plane.part(meshes.BOX, half_m[None], parts.GRASS, (0.105, 0.14, 0.045), layer=0))
+    plane_center, plane_half = contract.ground_plane(box_map)
+    plane = Boxes(
+        centers=(plane_center - origin)[None], half=plane_half[None], turns=np.eye(3)[None],
+        ids=np.full(1, NO_INSTANCE, np.uint16), seeds=np.zeros(1), kind=KINDS["Terrain"], tiers=np.zeros(1),
+    )  # fmt: skip
+    all_parts.append(plane.part(meshes.BOX, plane.half, parts.GRASS, PLANE_COLOR, layer=0))
+    scene_parts = Parts.concatenate(all_parts)
     loose = loose_solids(box_map, solids_of(box_map), origin, all_ids)
-    all_drawn = Parts.concatenate(all_parts)
-    lamps = np.zeros((0, 3)) if len(all_drawn.lamps()) else lamps_along_streets(box_map) - origin
-    return Scene(all_drawn, origin, contract.plane_z_m(box_map), loose, lamps)
+    lamps = np.zeros((0, 3)) if len(scene_parts.lamps()) else lamps_along_streets(box_map) - origin
+    return Scene(scene_parts, origin, contract.plane_z_m(box_map), loose, lamps)

@@ -95,6 +95,7 @@ def uniforms(params: WeatherParams) -> dict[str, Any]:
     grey = max(overcast * 0.9 + 0.1 * cloud_share, fog_share)  # share of the overcast colours
     direct = (1.0 - _step(0.25, 0.92, cloud_share)) * (1.0 - 0.92 * fog_share) * (1.0 - 0.6 * rain_share)
 
+    # Each colour is a mixture of that of the clear sky and that of the overcast one.
     clear = ClearSky.at(sun_altitude_deg)
     covered = clear.overcast_brightness * (1.0 - 0.32 * rain_share)
     lights_on = float(1.0 - _step(0.33, 0.50, clear.overcast_brightness * (1.0 - 0.30 * rain_share)))
@@ -160,11 +161,14 @@ def lamp_map(lamps_m: np.ndarray, middle_m: np.ndarray, half_m: float) -> tuple[
     """Compute the light of lamps over a square of the ground.
 
     Args:
-        lamps_m: (n, 3). middle_m: (2,) middle of the square. half_m: half the square's side.
+        lamps_m: (n, 3).
+        middle_m: (2,) middle of the square.
+        half_m: half the square's side.
 
     Returns:
         (MAP_PX, MAP_PX, 2) float32: light on the ground, about 1 under a lamp, and the height of the lamps that give
-        it; (4,) low x, low y, 1 / side, 1 / side. The outermost pixels are dark, so that nothing beyond is lit.
+        it. The outermost pixels are dark, so that nothing beyond is lit.
+        (4,) area of the map: low x, low y, 1 / side, 1 / side.
     """
     low_m = middle_m[:2] - half_m
     pixel_m = 2.0 * half_m / MAP_PX
@@ -172,18 +176,20 @@ def lamp_map(lamps_m: np.ndarray, middle_m: np.ndarray, half_m: float) -> tuple[
     light_times_height = np.zeros((MAP_PX, MAP_PX))
     reach_px = int(np.ceil(REACH_M / pixel_m))
     for x_m, y_m, z_m in lamps_m:
-        column, row = (x_m - low_m[0]) / pixel_m - 0.5, (y_m - low_m[1]) / pixel_m - 0.5
+        column = (x_m - low_m[0]) / pixel_m - 0.5
+        row = (y_m - low_m[1]) / pixel_m - 0.5
         rows = slice(max(0, int(row) - reach_px), max(0, int(row) + reach_px + 1))
         columns = slice(max(0, int(column) - reach_px), max(0, int(column) + reach_px + 1))
         v, u = np.ogrid[rows.start : min(rows.stop, MAP_PX), columns.start : min(columns.stop, MAP_PX)]
         squared_m2 = ((u - column) ** 2 + (v - row) ** 2) * pixel_m**2
         # The light falls with the cube of the distance to the lamp, and is 0 at REACH_M.
-        own = np.maximum((FALL_M**2 / (FALL_M**2 + squared_m2)) ** 1.5 - (FALL_M / REACH_M) ** 3, 0.0)
-        light[rows, columns] += own
-        light_times_height[rows, columns] += own * z_m
+        lamp_light = np.maximum((FALL_M**2 / (FALL_M**2 + squared_m2)) ** 1.5 - (FALL_M / REACH_M) ** 3, 0.0)
+        light[rows, columns] += lamp_light
+        light_times_height[rows, columns] += lamp_light * z_m
     height_m = np.where(light > 0.0, light_times_height / np.maximum(light, 1e-12), 0.0)
     light /= 1.0 + CROWDED * light
-    light[[0, -1]] = light[:, [0, -1]] = 0.0
+    light[[0, -1]] = 0.0
+    light[:, [0, -1]] = 0.0
     per_side = 0.5 / half_m
     return np.stack([light, height_m], axis=-1).astype(np.float32), np.array([*low_m, per_side, per_side])
 
@@ -192,6 +198,8 @@ def lamp_map(lamps_m: np.ndarray, middle_m: np.ndarray, half_m: float) -> tuple[
 
 SOFT_M = 0.25  # a wider penumbra is drawn as a soft border of shadows
 FAINT = 0.02  # a fainter sun casts no shadow
+MIRROR_FULL, MIRROR_FADE_M = 1.6, 75.0  # the mirror image of a lamp has the strength full - distance / fade, at most 1
+NUM_PHASES = 9973  # of the rain
 LAMP_UNIT, DEPTH_UNIT = 2, 3  # texture units
 WIND = (0.07, 0.03)  # metres east and north for each metre that a drop falls
 GLOW_FROM = 208  # brighter levels glow
@@ -216,6 +224,9 @@ def defines(params: WeatherParams) -> str:
 class WeatherPass:
     """The weather of a trajectory on one GL context."""
 
+    sun_direction: np.ndarray  # (3,) unit vector, set by `prepare`
+    _lamps: np.ndarray  # (n, 3) that puddles mirror, set by `prepare`
+
     def __init__(self, context: Any, over_color: Any, depth: Any, rain_program: Any) -> None:
         self._context = context
         self._depth = depth
@@ -231,8 +242,10 @@ class WeatherPass:
     ) -> None:
         """Compute the uniforms, and the light of lamps over a square around `middle`.
 
-        Places are in metres, relative to the origin of the parts. Puddles mirror the lamps of the parts only.
-        unseen_lamps: (n, 3), further lamps that give light.
+        Args:
+            parts: Their lamps give light, and puddles mirror them.
+            unseen_lamps: (n, 3), lamps that give light only. All places are in m, relative to the origin of the parts.
+            middle, half_m: Middle, (3,), and half the side of the square.
         """
         self._lamps = parts.lamps()
         self.sun_direction = light_direction(params)
@@ -259,13 +272,13 @@ class WeatherPass:
         nearest = nearest[away_m[nearest] < MIRRORED_WITHIN_M]
         lamps = np.zeros((MOST_NEAR, 4), np.float32)  # place, and strength, which falls to 0 with the distance
         lamps[: len(nearest), :3] = self._lamps[nearest]
-        lamps[: len(nearest), 3] = np.clip(1.6 - away_m[nearest] / 75.0, 0.0, 1.0)
+        lamps[: len(nearest), 3] = np.clip(MIRROR_FULL - away_m[nearest] / MIRROR_FADE_M, 0.0, 1.0)
         # The phase follows from the frame's content: drops differ between frames, but not when a frame is drawn again.
         hip_m = np.zeros(3) if person is None else np.asarray(person.hip_m, dtype=np.float64)
         content = np.ascontiguousarray(camera_pose, dtype=np.float64).tobytes() + hip_m.tobytes()
         return {
             **self.values,
-            "rain_phase": zlib.crc32(content) % 9973 / 9973.0,
+            "rain_phase": zlib.crc32(content) % NUM_PHASES / NUM_PHASES,
             "lamps": lamps.T,
             "num_lamps": len(nearest) if self.has_lights and self.values["wetness"] > 0.0 else 0,
         }
