@@ -27,9 +27,7 @@ from teacher_server import ENGLISH, MODEL, USAGE, Sent, TeacherServer, Wild, com
 from caption.schema import CaptionConfig
 from caption.stage.stage import run
 from caption.teachers.doctor import ODD_WORD, Finding, examine_endpoint
-from cosfly.formats.captions import Usage
 from cosfly.llm.client import KEY_VARIABLE, ChatClient, EndpointConfig
-from cosfly.llm.contract import Reply, Request
 from cosfly.llm.protocol import MEANINGS
 from cosfly.llm.student_chat import StudentEndpointConfig
 from cosfly.runtime.errors import NothingKept, TeacherError
@@ -270,15 +268,6 @@ def test_prompts_that_a_server_cuts_in_silence_are_reported(tmp_path, caplog):
         run(settings(server.url, limit=15), tree, tmp_path / "out")
     assert "all count 1000 tokens" in caplog.text
     assert caplog.text.count("the first request is sent, with a limit of 60 s") == 1
-
-
-@pytest.mark.parametrize(("step", "is_cut"), [(2, False), (10, True)])
-def test_only_prompts_of_clearly_different_lengths_show_a_cut(caplog, step, is_cut):
-    client = ChatClient("http://localhost:1", EndpointConfig())
-    reply = Reply("{}", Usage(prompt_tokens=1000, completion_tokens=1), "plain")
-    for k in range(8):
-        client._watch_prompts(reply, Request([{"role": "user", "content": "x" * (2000 + step * k)}], [], {}, {}))
-    assert ("all count 1000 tokens" in caplog.text) == is_cut
 
 
 def without_tokens(product: bytes) -> list[dict]:
