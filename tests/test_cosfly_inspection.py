@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cosfly.formats.boxes import read_boxes, write_boxes
-from cosfly.formats.frames import BystanderMeta, BystandersMeta, frame_name, read_instance
+from cosfly.formats.frames import BystanderMeta, BystandersMeta, depth_file, frame_name, read_depth, read_instance
 from cosfly.formats.inspection import read_inspection
 from cosfly.formats.issues import Report
 from cosfly.formats.kinds import KINDS
@@ -350,6 +350,19 @@ def slimmer(image: np.ndarray) -> np.ndarray:
         is_person[rows[0]] = False
         image[is_person] = (0, 1, KINDS["Roads"])
     return image
+
+
+@pytest.mark.parametrize("form", ["npy", "png"])
+def test_far_is_far(workplace, form):
+    folder, path = first_flight(workplace), first_flight(workplace) / FRAME / "depth.npy"
+    depth, top_row = np.load(path), np.arange(108)[:, None] == 0
+    name, data = depth_file(np.where(top_row, np.float32(1000.2), depth), form)
+    path.unlink()
+    (folder / FRAME / name).write_bytes(data)
+    sky = (0, 0, KINDS["Sky"])
+    edit_image(folder / FRAME / "instance.png", lambda image: np.where(top_row[..., None], sky, image).astype(np.uint8))
+    assert codes_of(inspect(workplace, NO_SUMS), folder) == {}
+    assert read_depth(folder / FRAME).max() == 1000.0
 
 
 def plant(specimen: Path, root: Path, defects: dict) -> None:
