@@ -192,17 +192,6 @@ def _npy(array) -> bytes:
     return buffer.getvalue()
 
 
-@pytest.mark.parametrize("order", ["C", "F"])
-def test_arrays_are_read_as_numpy_reads_them(order):
-    array = np.asarray(np.random.default_rng(0).random((7, 5)), dtype=np.float32, order=order)
-    for found in (
-        arrays.parse_array(_npy(array), "x", dtype=np.float32, ndim=2),
-        np.load(io.BytesIO(depth_bytes(array))),
-    ):
-        assert (found == array).all()
-        assert found.flags.writeable
-
-
 GOOD = _npy(np.zeros((7, 5), np.float32))
 
 
