@@ -11,8 +11,6 @@ from release_tampering import depth_of, pixels_of, png, set_depth
 
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.geometry.axes import box_corners, project, world_from_camera
-from release.build.config import ReleaseConfig
-from release.rules import split_flights
 
 Row = dict[str, Any]
 Rows = list[Row]
@@ -191,42 +189,11 @@ def not_a_number(row: Row) -> None:
     set_depth(row, depth)
 
 
-def one_thing_farther(row: Row) -> None:
-    pixels, depth = pixels_of(row, "instance"), depth_of(row)
-    ids = pixels[..., 1].astype(int) | pixels[..., 2].astype(int) << 8
-    sizes = {k: (ids == k).sum() for k in np.unique(ids) if k not in (0, 65534, 65535) and depth[ids == k].max() < 900}
-    depth[ids == max(sizes, key=lambda k: sizes[k] if sizes[k] < ids.size / 4 else 0)] *= np.float32(1.08)
-    set_depth(row, depth)
-
-
 def ids_exchanged(pixels: np.ndarray, ids: np.ndarray) -> None:
     known, new = [k for k in np.unique(ids) if k not in (0, 65534, 65535)], ids.copy()
     for own, other in zip(known, [*known[1:], known[0]], strict=True):
         new[ids == own] = other
     pixels[..., 1], pixels[..., 2] = new & 255, new >> 8
-
-
-def frame_mirrored_with_its_boxes(row: Row) -> None:
-    width, instance = row["width_px"], pixels_of(row, "instance")[:, ::-1].copy()
-    row["instance"]["bytes"], row["target_mask_bbox"] = png(instance), box_of_person(instance)
-    row["image"]["bytes"] = png(pixels_of(row, "image")[:, ::-1].copy())
-    set_depth(row, depth_of(row)[:, ::-1].copy())
-    row["target_uv"]["u_px"] = width - row["target_uv"]["u_px"]
-    box = row["target_bbox"]
-    box["xmin_px"], box["xmax_px"] = width - box["xmax_px"], width - box["xmin_px"]
-
-
-def walk_of_nobody(rows: Rows) -> None:
-    """Rename a walk so that its rank gives it another split, by the settings of a release that are not changed."""
-    walk, cfg = clean(rows)[0]["walk"], ReleaseConfig()
-
-    def splits(name: str) -> dict[str, str]:
-        places = {row["walk"]: (name if row["walk"] == walk else row["walk"], "") for row in rows}
-        return split_flights(places, "walk", cfg.fractions, cfg.split_seed)
-
-    names = (walk[:-2] + f"{number:02x}" for number in range(256))
-    new = next(name for name in names if splits(name) != splits(walk))
-    put(lambda _: [row for row in rows if row["walk"] == walk], walk=new)(rows)
 
 
 def second_person(pixels: np.ndarray, ids: np.ndarray) -> None:
@@ -264,7 +231,6 @@ LIES_OF_ROWS: dict[str, Lie] = {
     ),
     "hard_conflict_called_soft": change(at(captioned, 1), hard_conflict_called_soft),
     "split_that_leaks": alter(clean, split=lambda old: "test" if old != "test" else "train"),
-    "walk_of_nobody": walk_of_nobody,
     "pair_lost": put(clean, pair=None),
 }  # fmt: skip
 LIES_OF_PIXELS: dict[str, Lie] = {
@@ -276,11 +242,9 @@ LIES_OF_PIXELS: dict[str, Lie] = {
     "depth_not_a_number": change(at(clean, 3), not_a_number),
     "depth_in_centimetres_called_lossless": change(clean, with_depth(lambda depth, _: np.round(depth, 2))),
     "depth_set_off": change(everything, with_depth(lambda depth, _: depth + 0.3)),
-    "thing_farther_in_one_frame": change(middle, one_thing_farther),
     "empty_instances": change(at(seen, 2), with_ids(lambda pixels, _: pixels.fill(0))),
     "second_person_far_away": change(middle_seen, with_ids(second_person, box=True)),
     "ids_of_things_exchanged": ids_of_things_exchanged,
-    "frame_mirrored_with_its_boxes": change(middle_seen, frame_mirrored_with_its_boxes),
     "jpeg_under_a_png_name": change(
         at(clean, 2),
         lambda r: r["image"].update(bytes=cv2.imencode(".jpg", pixels_of(r, "image"))[1].tobytes()),

@@ -1,6 +1,5 @@
 """Hand-made worlds for planners, and the check that a flight through them is safe."""
 
-from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ from cosfly.formats.boxes import BoxMap, write_boxes
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory, write_paths
 from cosfly.geometry import kernels
 from cosfly.geometry.axes import DT_S
-from cosfly.planners.contract import PlanConfig, TrackingReference
+from cosfly.planners.contract import PlanConfig
 from cosfly.planners.muco.loss import evaluate, make_state
 from cosfly.planners.stage import make_scenario
 from specimens import map_of
@@ -69,14 +68,6 @@ def solved_by_scipy(first, problem, obstacles, **options):
     bounds = [pair for low, _, high in problem.altitudes[1:-1] for pair in ((None, None), (None, None), (low, high))]
     start = first[1:-1].reshape(-1)
     return minimize(loss_and_gradient, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-
-
-def first_points(scenario, num):
-    reference = {f.name: getattr(scenario.reference, f.name) for f in fields(scenario.reference)}
-    reference = TrackingReference(
-        **{name: value if isinstance(value, bool) else value[:num] for name, value in reference.items()}
-    )
-    return replace(scenario, targets_m=scenario.targets_m[:num], ground_m=scenario.ground_m[:num], reference=reference)
 
 
 def assert_safe(positions, obstacles, cfg=PlanConfig(), ground_m=0.0):

@@ -19,12 +19,11 @@ from caption.teachers.prompt_files import (
     export_prompts,
     own_prompts,
     shipped_prompts,
-    slots_of,
     vocabulary_of,
 )
 from caption.teachers.prompts import user_prompts
 from caption.verification.facts import measure_facts
-from caption.verification.references import Fact, look_up, parse_reference
+from caption.verification.references import look_up, parse_reference
 from cosfly.formats.captions import OWN_PROMPTS, PICTURES_MARK, Coc, Prompt, read_captions
 from cosfly.formats.people import Goal
 from cosfly.formats.playback_file import read_track
@@ -104,21 +103,6 @@ def test_nothing_is_stated_of_a_hidden_target():
     assert paper[7].endswith(": unknown; (101.00, 20.00, 0.90); (100.00, 20.00, 0.90); unknown; unknown.")
 
 
-def test_a_change_is_the_fact_of_its_slot():
-    window = make_window((True, False, False, False, False))
-    lines, facts = lines_of(window), measure_facts(window)
-    for line, words, slot in (
-        (4, "higher by", "change:altitude"),
-        (7, "nearer by", "change:distance"),
-        (9, "larger by", "growth:box_height"),
-    ):
-        reference = parse_reference(slot)
-        assert reference is not None
-        fact = look_up(reference, facts)
-        assert isinstance(fact, Fact)
-        assert [float(change) for change in re.findall(rf"{words} ([\d.]+) ", lines[line])] == [abs(float(fact.value))]
-
-
 def test_the_relative_state_does_not_depend_on_the_place_in_the_world():
     window = make_window()
     turned = dataclasses.replace(window, frames=tuple(
@@ -139,18 +123,6 @@ def test_the_papers_state():
     assert lines[2] == "Altitude: [20.0, 20.0, 20.0, 20.0, 20.0] m."
     assert lines[4] == "Target ground speed: 2.00 m/s."
     assert lines[6].partition(": ")[2].startswith("(100.00, 0.00, 20.00; -45.0, 90.0, 0.0); (100.00, 0.50,")
-
-
-def test_measurements_can_be_omitted():
-    for vocabulary in (RELATIVE, PAPER):
-        for user in user_prompts(window := make_window(), measure_facts(window), vocabulary).values():
-            assert Prompt(system="", user=user).told("P", measured=False).user.count("\n") == 0
-
-
-def test_the_questions_of_both_languages_have_the_same_slots():
-    for name in ("user", "user_paper"):
-        english, chinese = (set(slots_of(shipped_prompts()[f"{name}_{language}"])) for language in ("en", "zh"))
-        assert english == chinese
 
 
 def test_the_example_of_the_slots_prompt_is_accepted():
@@ -265,12 +237,6 @@ def test_a_prompt_tells_the_goal_and_the_others_in_both_languages(flight):
     assert numbers == [["0", "1", "2", "3", "3", "4.0", "3.5", "2.3", "2.5", "2", "1", "1", "1"]] * 2
     for text in prompts.values():  # pictures alone: the goal stays
         assert Prompt(system="", user=text).told("P", measured=False).user.count("\n") == 1
-
-
-def test_without_other_people_a_prompt_is_as_it_was(flight):
-    plain, alone = window_of(flight), window_of(replace(flight, goal=GOAL))
-    told = [user_prompts(one, measure_facts(one), RELATIVE) for one in (plain, alone)]
-    assert told[0] == told[1]
 
 
 def test_what_is_said_of_others_is_judged_by_the_geometry(flight):

@@ -9,11 +9,6 @@ from caption.schema import WindowConfig
 from caption.stage.windows import cut_windows
 from caption.teachers.rule_decisions import is_shaken, ranked
 from caption.teachers.rules import (
-    FAMILIES,
-    STRIKING_TOPICS,
-    TOPICS,
-    TOPICS_HIDDEN,
-    TOPICS_ORDERED,
     sentences,
     write_templates,
 )
@@ -90,12 +85,3 @@ def test_a_decision_without_a_reason_is_not_argued(facts):
     assert all(answer is None for answer in given["return_to_home"])
     assert any(answer is None for answer in given["yaw_left_to_follow"])
     assert all(answer is None or answer[0]["flight_decision"] == token for token in TOKENS for answer in given[token])
-
-
-def test_each_decision_has_a_family_and_each_family_sentences():
-    assert sorted(token for family in FAMILIES.values() for token in family.tokens) == sorted(TOKENS)
-    assert len({english for english, _ in PAIRS}) >= 60
-    for name, family in FAMILIES.items():
-        assert sentences()["reasons"][name]
-        assert sentences()["consequences"][family.consequences]
-    assert {*TOPICS, *TOPICS_HIDDEN, *TOPICS_ORDERED, *STRIKING_TOPICS} == sentences()["facts"].keys()

@@ -39,7 +39,6 @@ def filled(text: str, language: Language, facts: Facts = FACTS) -> str | Refused
 def test_what_a_template_becomes():
     for language, template, text in [
         ("en", "The gap {trend:distance} from {distance@t0} to {distance}.", "The gap decreases from 20.0 m to 18.0 m."),
-        ("en", "The gap is now {trend:distance}.", "The gap is now decreasing."),
         ("en", "The gap has {trend:distance} to {distance}.", "The gap has decreased to 18.0 m."),
         ("en", "A {trend:speed} pace and a {trend:distance} gap.", "An increasing pace and a decreasing gap."),
         ("en", "It lies {offset_x} to the {side:offset_x} of the middle.", "It lies 64 px to the left of the middle."),
@@ -49,10 +48,8 @@ def test_what_a_template_becomes():
         ("en", "The height {trend:altitude} by {change:altitude}.", "The height increases by 2.0 m."),
         ("en", "The box measures {box@t4} now, {box@t0} then.", "The box measures 36 x 72 px now, 30 x 60 px then."),
         ("en", "The box {trend:box_height} by {growth:box_height}.", "The box increases by 20%."),
-        ("en", "Pitch is {pitch} here.", "Pitch is -40.3 deg here."),
         ("en", "It was {visibility@t3} at t3.", "It was occluded at t3."),
         ("en", "The drone is {comparison:speed} the walker.", "The drone is faster than the walker."),
-        ("en", "The drone is {comparison:speed} than the walker.", "The drone is faster than the walker."),
         ("en", "The drone is {comparison:speed}.", "The drone is faster."),
         ("en", "The gap is {distance} m wide.", "The gap is 18.0 m wide."),  # the unit once
         ("en", "At {speed} m/s it flies.", "At 4.00 m/s it flies."),
@@ -61,9 +58,7 @@ def test_what_a_template_becomes():
         ("en", "The walker {target_motion} and is {target_motion}.", "The walker walks and is walking."),
         ("zh", "水平距离从 {distance@t0}{trend:distance}到 {distance}。", "水平距离从 20.0 米减小到 18.0 米。"),
         ("zh", "目标位于画面中心{side:offset_x}侧 {offset_x} 处。", "目标位于画面中心左侧 64 像素处。"),
-        ("zh", "边界框为 {box@t4}。", "边界框为 36 × 72 像素。"),
         ("zh", "无人机{comparison:speed}目标，因此{decision}。", "无人机快于目标，因此向右偏航跟随。"),
-        ("zh", "t3 时目标{visibility@t3}。", "t3 时目标被遮挡。"),
         ("zh", "高度为 {altitude} 米。", "高度为 22.0 米。"),
     ]:  # fmt: skip
         assert filled(template, language) == text
@@ -281,7 +276,6 @@ LEFTWARD = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, 6.0, 10.0))
 
 def test_the_fact_at_an_address():
     for address, fact in [
-        ("distance", Fact(18.0, "m", 1)),
         ("distance@t3", "unknown_fact"),
         ("distance@t5", "unobserved_frame"),
         ("change:distance", Fact(-2.0, "m", 1)),
@@ -289,19 +283,14 @@ def test_the_fact_at_an_address():
         ("rate:altitude@t3-t4", Fact(2.0, "mps", 1)),
         ("rate:yaw@t2-t4", Fact(7.0, "dps", 1)),
         ("climb_rate@t2", Fact(1.0, "mps", 2)),
-        ("mean:speed", Fact(2.75, "mps", 2)),
         ("mean:speed@t2-t4", Fact(3.17, "mps", 2)),
         ("mean:target_speed", Fact(1.6, "mps", 2)),
         ("change:target_heading", "unknown_fact"),
         ("side:yaw", Fact("left")),
-        ("side:offset_x", Fact("left")),
         ("side:offset_x@t1", Fact("centred")),
         ("side:offset_y", Fact("below")),
         ("trend:speed", Fact("increasing")),
         ("trend:pitch", Fact("steady")),
-        ("trend:distance", Fact("decreasing")),
-        ("comparison:speed", Fact("faster")),
-        ("visibility@t3", Fact("occluded")),
         ("target_motion", Fact("walking")),
         ("drone_motion", Fact("moving")),
         ("bearing", "unknown_fact"),

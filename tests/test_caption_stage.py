@@ -15,7 +15,6 @@ from specimens_captions import VOCABULARY, report_of, saying
 from teacher_server import TeacherServer, is_mirror, obedient_answer
 
 from caption.schema import CaptionConfig, JudgeConfig, RepairConfig, WindowConfig
-from caption.stage import compare as compare_stage
 from caption.stage import stage
 from caption.stage.compare import Trial, compare, try_strategy
 from caption.stage.stage import run
@@ -214,17 +213,6 @@ def test_a_conflict_without_a_reason_for_its_label_counts_as_not_repaired(strate
     repaired = [trial for trial in trials if trial.last is not None]
     assert 0 < len(repaired) < len(trials)
     assert compare(strategy, trials).consistency == round(len(repaired) / len(trials), 3)
-
-
-def test_a_window_without_a_conflict_is_asked_about_once(monkeypatch):
-    asked = []
-
-    async def agree(*args) -> None:
-        asked.append(args[-1])
-
-    monkeypatch.setattr(compare_stage, "try_strategy", agree)
-    assert asyncio.run(compare_stage._try_each(*[None] * 4)) == []
-    assert asked == [compare_stage.STRATEGIES[0]]
 
 
 def coc(text: str) -> Coc:

@@ -10,7 +10,7 @@ import pytest
 from specimens_captions import VOCABULARY
 from teacher_server import TeacherServer
 
-from caption.schema import CaptionConfig, FutureMotion, ImageConfig, ObservedWindow, WindowConfig, observed_frames
+from caption.schema import CaptionConfig, ImageConfig, WindowConfig, observed_frames
 from caption.stage.stage import run
 from caption.stage.windows import current_frames, cut_future, cut_windows, recorded_motion
 from caption.teachers.prompts import make_question, question_messages
@@ -43,18 +43,6 @@ def flight_in(root):
 )
 def test_current_frames_have_a_whole_past_and_future(num_points, stride, expected):
     assert list(current_frames(num_points, WindowConfig(stride=stride))) == expected
-
-
-def test_the_observed_type_has_no_future_and_shares_no_memory_with_it(tree):
-    flight = flight_in(tree)
-    sample = next(cut_windows(flight, WindowConfig()))
-    assert not any(field.type == FutureMotion.__name__ for field in dataclasses.fields(ObservedWindow))
-    assert [frame.time_s for frame in sample.observed.frames] == flight.time_s[:5].tolist()
-    values = [
-        *vars(sample.observed).values(),
-        *(value for one in sample.observed.frames for value in vars(one).values()),
-    ]
-    assert not any(isinstance(value, np.ndarray) for value in values)  # which could be a view into the flight
 
 
 def spoil_future(root, current: int) -> None:

@@ -82,10 +82,6 @@ def test_a_command_that_cannot_be_flown_is_the_students_failure_and_the_drone_ho
     assert under_way.moments[-1].index == moment.index + 1
 
 
-def test_the_table_has_a_row_for_each_decision():
-    assert sorted(CONTROLS) == sorted(TOKENS)
-
-
 LOOK = {"width_px": 160, "height_px": 90, "fovs_deg": (90.0,)}
 PITCH_DEG = -44.0
 

@@ -78,7 +78,6 @@ BODIES: list[tuple[str, bytes, str | tuple[str]]] = [
         "text": TEXT[9:]}]), TEXT),
     ("gateways: a reasoning part that has a text", assistant(content=[{"type": "reasoning", "text": "{}"},
         {"type": "output_text", "text": TEXT}]), TEXT),
-    ("gateways: parts without a type", assistant(content=[{"text": TEXT}]), TEXT),
     ("gateways: parts of other kinds", assistant(content=[{"type": "image_url"}, None, 3, {"type": "text", "text": 3}]),
         ""),
     ("LiteLLM: a schema served by a function", assistant(content=None, tool_calls=[{"function":
@@ -99,7 +98,6 @@ BODIES: list[tuple[str, bytes, str | tuple[str]]] = [
     ("Gemini behind a gateway: finish_reason error", completion({"content": TEXT}, finish_reason="error"), ("an error",
     )),
     ("routers: choices null", b'{"choices": null}', ("no choices",)),
-    ("routers: choices empty", b'{"choices": []}', ("no choices",)),
     ("routers: a choice that is null", b'{"choices": [null]}', ("no choices",)),
     ("routers: no message", completion(None), ("no text",)),
     ("vLLM: thoughts that use up all tokens", completion({"role": "assistant"}, finish_reason="length"), ""),
@@ -107,14 +105,10 @@ BODIES: list[tuple[str, bytes, str | tuple[str]]] = [
     ("proxies: events though none were asked for", b'data: {"choices": []}\n\n', ("not JSON",)),
     ("proxies: events without a choice", b'data: {"choices": [null]}\n\ndata: [DONE]\n', ("no text",)),
     ("proxies: events without a delta", b'data: {"choices": [{"delta": ["x"]}]}\n\ndata: [DONE]\n', ("no text",)),
-    ("proxies: a list", b"[1]", ("no choices",)),
-    ("proxies: nothing", b"", ("not JSON",)),
     ("vLLM: NaN among the logprobs", completion({"content": TEXT}, logprobs=[float("nan")]), ("not JSON",)),
     ("nobody yet: nested 100,000 deep", b"[" * 100_000, ("not JSON",)),
-    ("nobody yet: nested 90 deep", b'{"choices":' + b"[" * 90 + b"]" * 90 + b"}", ("no choices",)),
     ("nobody yet: an integer of 5,000 digits", b'{"choices": [' + b"9" * 5000 + b"]}", ("not JSON",)),
     ("nobody yet: an object of infinity", assistant(content={"a": "Q"}).replace(b'"Q"', b"1e999"), ("no text",)),
-    ("nobody yet: bytes of no encoding", b"\xff\xfe\xfa\x00", ("not JSON",)),
 ]  # fmt: skip
 
 
@@ -183,7 +177,6 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("any model: thoughts between two drafts", f"<think>a</think>{DRAFT}<think>no</think>{TEXT}", (THINK,)),
     ("DeepSeek: thoughts after the answer", f"{TEXT}\n<think>that should do</think>", "only_thinking"),
     ("R1, cut off: thoughts that never end", f"<think>So I would say {DRAFT} but", "only_thinking"),
-    ("R1: thoughts alone", f"<think>So I would say {DRAFT}</think>", "only_thinking"),
     *((f"tags {begins}", f"{begins}{DRAFT}{ends}{TEXT}", (THINK,)) for begins, ends in (
         ("<thinking>", "</thinking>"), ("<reasoning>", "</reasoning>"), ("<thought>", "</thought>"),
         ("<THINK>", "</Think>"), ("[THINK]", "[/THINK]"), ("<|channel>thought\n", "<channel|>"))),
@@ -199,16 +192,13 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
         f"<|channel|>commentary to=functions.answer <|constrain|>json<|message|>{TEXT}<|call|>", "only_thinking"),
     # fences, prose, drafts
     ("most models without a schema: a fence", f"```json\n{PRETTY}\n```", (FENCE,)),
-    ("stopped at the fence: not opened", f"{TEXT}\n```", (FENCE,)),
     ("any model: a fence in a fence", f"````markdown\n```json\n{TEXT}\n```\n````", (FENCE, PROSE)),
-    ("any model: an example in a fence, then the answer", f"```json\n{{\"a\": 1}}\n```\n{TEXT}", (FENCE, PROSE)),
     ("any model: a fence in the text of a field",
         changed(reasoning_trace="As ```json {}``` shows, nothing has to change."),
         "As ```json {}``` shows, nothing has to change."),
     ("any model: prose round it", f"Sure! Here it is:\n{TEXT}\nI hope this helps.", (PROSE,)),
     ("any model: braces in the prose", f"The set {{left, right}} and {{}} {TEXT} as in {{t0..t4}}.", (PROSE,)),
     ("any model: two drafts, the last counts", f"{DRAFT}\n{TEXT}", (PROSE,)),
-    ("templates of Python: doubled braces", f"{{{TEXT}}}", (PROSE,)),
     ("vLLM, Qwen3 with thinking off: a brace too many", f"{{\n{TEXT}", (PROSE,)),
     # wrapped
     ("Llama 3, Ollama: a function call as text", f'{{"name": "chain_of_cause", "parameters": {TEXT}}}', ("wrapped",)),
@@ -216,7 +206,6 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("small models: the schema itself", json.dumps({"properties": {name: {"type": "string"} for name in GOOD}}),
         "field_not_text"),
     ("any model: two of them in one", f'{{"draft": {DRAFT}, "final": {TEXT}}}', "missing_field"),
-    ("any model: in two wrappers", f'{{"a": {{"a": {TEXT}}}}}', "missing_field"),
     # as models write JSON
     ("any model: curly quotes in a text", changed(reasoning_trace="The “person” keeps to the middle of the image."),
         "The “person” keeps to the middle of the image."),
@@ -225,7 +214,6 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("small models: a key twice", TEXT[:-1] + ', "flight_decision": "hover"}', "duplicate_key"),
     ("small models: a key twice in a draft", f'{DRAFT[:-1]}, "flight_decision": "ascend"}}\n{TEXT}', (PROSE,)),
     ("vLLM 0.26, a random model: raw control characters", TEXT.replace("walks", "wal\x0fks"), ("control_characters",)),
-    ("any model: a raw line break in a text", TEXT.replace("walks ahead", "walks\nahead"), GOOD["reasoning_trace"]),
     ("any model: an escaped zero", TEXT.replace("walks", "walks\\u0000"), ("control_characters",)),
     # broken
     ("any server", "", "empty"),
@@ -233,13 +221,10 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("any model: a list", '["hover"]', "no_json_object"),
     ("any server: cut off in a text", HALF, "broken_json"),
     ("any model: a draft, then cut off", f"{DRAFT}\nNo: {HALF}", "broken_json"),
-    ("Ollama with thoughts on: begins twice", f'{{"{TEXT}', (PROSE,)),
     ("any model: quotes in a text", TEXT.replace("person", 'person "in red"'), "broken_json"),
     ("numpy habits: NaN", TEXT[:-1] + ', "claims": [NaN]}', "not_finite"),
     ("nobody yet: an integer of 5,000 digits", TEXT[:-1] + ', "claims": ' + "9" * 5000 + "}", "not_finite"),
     ("nobody yet: nested 10,000 deep", '{"a":' * 10_000 + "1" + "}" * 10_000, "broken_json"),
-    ("nobody yet: lists nested 10,000 deep", '{"a":' + "[" * 10_000 + "]" * 10_000 + "}", "broken_json"),
-    ("random models: brackets for ever", "{" * 50_000, "broken_json"),
     ("random models: longer than anybody reads", TEXT + " " * 100_000, "too_long"),
     ("any model: half a surrogate pair", TEXT.replace("person", "person \\ud83d"), "unreadable_character"),
     ("any model: a whole pair", TEXT.replace("person", "person \\ud83d\\udeb6"),
@@ -248,20 +233,15 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     # of the right shape
     ("small models: a field is missing", json.dumps({name: GOOD[name] for name in list(GOOD)[1:]}), "missing_field"),
     ("any model without a schema: another field", changed(confidence="high"), "extra_field"),
-    ("any model: one object a line", "\n".join(json.dumps({name: text}) for name, text in GOOD.items()),
-        "missing_field"),
     ("any model: a list for a text", changed(critical_components=["a person", "a road", "a tree", "a house"]),
         "field_not_text"),
     ("any model: the schema's minimum", changed(reasoning_trace="ok"), "reasoning_trace_too_short"),
-    ("small models: dots for a text", changed(reasoning_trace="." * 40), "reasoning_trace_placeholder"),
     ("small models: dots in the end", changed(reasoning_trace="The person keeps to the middle of the image ..."),
         "reasoning_trace_placeholder"),
     ("small models: the prompt's words", changed(critical_components="<what is seen in the five frames>"),
         "critical_components_placeholder"),
     ("DeepSeek, Qwen: answers in Chinese", json.dumps(CHINESE | {"critical_components": "目标行人在前方的人行道上行走，速度保持不变，没有遮挡。"}),
         "critical_components_wrong_language"),
-    ("GLM: half in Chinese", changed(reasoning_trace="The person 保持在画面中央，因此无需改变动作，继续跟随目标行人前进，保持距离"),
-        "reasoning_trace_wrong_language"),
     ("any model: another decision", changed(flight_decision="do a barrel roll"), "decision_not_in_closed_set"),
 ]  # fmt: skip
 
@@ -282,16 +262,13 @@ def test_texts(subtests):
 # The same of Chinese answers; None: the object as it stands.
 CHINESE_TEXTS: list[tuple[str, str, str | None]] = [
     ("any model", ZH, None),
-    ("any model: escapes for all of it", json.dumps(CHINESE), None),
     ("Qwen: Chinese prose round it", f"好的，以下是翻译结果：\n```json\n{ZH}\n```\n希望对您有帮助！", None),
-    ("DeepSeek: quotes in a text", ZH.replace("行人保持", '"行人"保持'), "broken_json"),
     ("any model: English for Chinese", TEXT, "critical_components_wrong_language"),
     ("small models: one field left in English", json.dumps(CHINESE | {"reasoning_trace": GOOD["reasoning_trace"]}),
         "reasoning_trace_wrong_language"),
     ("slots: names of facts are no English",
         json.dumps(CHINESE | {"reasoning_trace": "速度为{speed@t4}，距离{distance@t4}，{trend:speed}。"}),
         "速度为{speed@t4}，距离{distance@t4}，{trend:speed}。"),
-    ("any model: short", json.dumps(CHINESE | {"reasoning_trace": "保持。"}), "reasoning_trace_too_short"),
 ]  # fmt: skip
 
 

@@ -1,19 +1,13 @@
 """The command line and its settings: what a person reads when something is wrong, exit codes, the nearest name."""
 
-import ast
-import importlib
 import logging
-import re
-import subprocess
 import sys
-from inspect import Parameter, signature
 from pathlib import Path
 
 import pytest
 from pydantic import BaseModel, Field
 
 from cosfly import cli
-from cosfly.cli import options
 from cosfly.cli.options import Job, resolve
 from cosfly.cli.run import print_run
 from cosfly.llm.protocol import base_url
@@ -39,19 +33,6 @@ def answer(capfd, monkeypatch, *words: str) -> tuple[int, str]:
     with pytest.raises(SystemExit) as end:
         cli.main()
     return int(end.value.code or 0), capfd.readouterr().err
-
-
-def test_what_an_option_does_not_take_is_told_in_words_for_people(capfd, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
-    for words, told in (
-        ("run quickstart --workers two", "valid integer, unable to parse string as an integer"),
-        ("caption --tracks x", "'x' is not one of 'clean', 'perturbed', 'both'"),
-        ("plan --out x", "Missing option '--map'"),
-        ("plan compare a b", "Missing option '--out'"),  # what the stage needs, a command below it does not
-    ):
-        status, error = answer(capfd, monkeypatch, *words.split())
-        assert status == 2
-        assert told in error
 
 
 def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
@@ -98,25 +79,6 @@ def test_a_folder_with_the_name_of_a_section_does_not_hide_its_settings(capfd, m
     assert status == 0
 
 
-IMPORTING = """
-import os, signal, sys
-class Interrupts:
-    def find_spec(self, name, *_):
-        if name == "typer":
-            os.kill(os.getpid(), signal.SIGINT)
-sys.meta_path.insert(0, Interrupts())
-from cosfly.__main__ import main
-main()
-"""
-
-
-def test_ctrl_c_during_the_imports_is_one_line():
-    done = subprocess.run([sys.executable, "-c", IMPORTING], capture_output=True, text=True, check=False)
-    assert done.returncode == 130
-    assert done.stderr.startswith("error: interrupted")
-    assert done.stderr.count("\n") == 1
-
-
 def test_failed_items_make_the_command_exit_1_unless_the_settings_accept_them(capfd, tmp_path):
     write_json(tmp_path / "product", {})
     stage = StageFolder(tmp_path, "plan", is_complete=False)
@@ -146,31 +108,6 @@ def test_every_form_of_an_address_leads_to_one_root():
         "https://h/api/v3/": "https://h/api/v3",
     }
     assert {url: base_url(url) for url in roots} == roots
-
-
-def test_every_common_option_of_a_command_is_taken_by_a_function_that_it_calls():
-    """An option that no function takes would be ignored without a word."""
-    texts = [
-        (ROOT / f"cosfly/cli/{name}.py").read_text() for name in ("stages", "run", "caption", "distill", "release")
-    ]
-    names = vars(options)
-    commands = 0
-    for function in (node for text in texts for node in ast.parse(text).body if isinstance(node, ast.FunctionDef)):
-        for decorator in (d for d in function.decorator_list if isinstance(d, ast.Call)):
-            common = [*decorator.args[2:3], *(k.value for k in decorator.keywords if k.arg == "common")]
-            listed = set(eval(ast.unparse(common[0]), names).split()) if common else set()  # a constant of `options`
-            body = ast.unparse(function.body)
-            taken = {name for name in ("seed", "workers") if f"job.{name}" in body or f"{name}=" in body}
-            if re.search(r"\(job, |\(job\.cfg, ", body):  # which holds seed and workers
-                taken |= {"seed", "workers"}
-            for target in re.findall(r"job\.(?:call|run)\('([\w.:]+)'", body):
-                module, _, name = target.partition(":")
-                parameters = signature(getattr(importlib.import_module(module), name or "run")).parameters
-                is_open = any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters.values())
-                taken |= {"seed", "workers"} if is_open else {*parameters}
-            assert listed & {"seed", "workers"} <= taken, function.name
-            commands += 1
-    assert commands > 30
 
 
 class Inner(Config):

@@ -15,13 +15,11 @@ from cosfly.formats.boxes import make_box_map
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback_file import read_track, write_track
 from cosfly.formats.roi import Roi
-from cosfly.formats.segments import Mission, Segment
 from cosfly.formats.traces import DroneTrace
 from cosfly.geometry import kernels
 from cosfly.geometry.axes import (
     intrinsic_matrix,
     look_at,
-    mirror_poses,
     project,
     rotation_matrices,
     rotation_matrix,
@@ -63,18 +61,6 @@ def test_image_axes():
     assert uv[1, 1] < 360
     assert np.isnan(uv[2]).all()
     assert z[2] == -10
-
-
-def test_mirroring_is_its_own_inverse_and_keeps_the_picture():
-    point, eye, rotation = np.array([12.0, 5.0, 1.0]), np.array([0.0, 1.0, 20.0]), np.array([-40.0, 25.0, 0.0])
-    assert_allclose(mirror_poses(mirror_poses(point)), point)
-    assert_allclose(mirror_poses(mirror_poses(rotation)), rotation)
-    k = intrinsic_matrix(1280, 720, 90)
-    uv, z = project(point[None], world_from_camera(eye, rotation), k)
-    mirrored = world_from_camera(mirror_poses(eye), mirror_poses(rotation))
-    uv_mirrored, z_mirrored = project(mirror_poses(point)[None], mirrored, k)
-    assert_allclose(z, z_mirrored)
-    assert_allclose(uv_mirrored, [[1280 - uv[0, 0], uv[0, 1]]])
 
 
 CAMERA = np.array([80.0, 80.0, 80.0, 45.0])
@@ -220,10 +206,6 @@ def random_boxes(rng, num_boxes, spread_m=60.0, tilt=True):
     return kernels.index_boxes(centers, rng.uniform(0, 8, (num_boxes, 3)), rotation_matrices(angles))
 
 
-def index_of_one(half, center=(0, 0, 0)):
-    return kernels.index_boxes([center], [half], np.eye(3)[None])
-
-
 def test_nearest_agrees_with_all_pairs(subtests):
     for cell_m in [1.0, 8.0, 500.0]:
         for seed in range(4):
@@ -286,17 +268,6 @@ def test_visibility_agrees_with_slow_rays():
     np.testing.assert_allclose(kernels.visibility(index, drones, targets), expected)
 
 
-def test_a_wall_hides_what_it_should():
-    wall = index_of_one(center=(10, 0, 0.5), half=(0.1, 5, 0.5))  # 1 m high, so from low down it hides the legs only
-    drone, target = [(20.0, 0.0, 1.0)], [(0.0, 0.0, 0.9)]
-    assert kernels.visibility(wall, drone, target)[0] == pytest.approx(0.2)  # only the head's ray passes over
-    assert kernels.visibility(wall, [(20.0, 0.0, 20.0)], target)[0] == 1.0
-    assert kernels.visibility(wall, [(20.0, 9.0, 0.0)], target)[0] == pytest.approx(0.0)
-    assert kernels.visibility(wall, [(20.0, 11.0, 0.0)], target)[0] == 1.0  # past its end
-    index = index_of_one(half=(2, 2, 2))  # somebody inside a box is hidden from everywhere
-    assert kernels.visibility(index, [(20.0, 0.0, 20.0), (-9.0, 3.0, 50.0)], [(0.0, 0.0, 0.9)] * 2).tolist() == [0, 0]
-
-
 def curve(num: int) -> DroneTrace:
     """A flight on a curve, whose heading passes the south."""
     time_s = np.arange(num) * 0.1
@@ -305,11 +276,7 @@ def curve(num: int) -> DroneTrace:
     rotations = np.stack([-30 - time_s, yaw_deg, np.zeros(num)], axis=1)
     targets = np.stack([np.zeros(num), time_s, np.full(num, 0.9)], axis=1)
     ones = np.ones(num)
-    segments = (Segment("follow", 0, 12), Segment("orbit", 12, 13), Segment("hold", 13, num))
-    return DroneTrace(
-        "p", "none", time_s, positions, rotations, targets, ones, 5 + np.cos(time_s * 7), segments=segments,
-        mission=Mission("battery", 16, 21, (1.0, 2.0, 3.0)),
-    )  # fmt: skip
+    return DroneTrace("p", "none", time_s, positions, rotations, targets, ones, ones)
 
 
 def motion_of(time_s, poses) -> PlannedMotion:

@@ -19,8 +19,7 @@ from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.footprints import united
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map, run
-from cosfly.runtime.config import build
-from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.errors import InputError
 from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.simplify.stage import cross_validate
 
@@ -227,16 +226,6 @@ def test_the_census_town_has_the_papers_counts_and_simplifies_to_a_few_thousand(
     assert cross_validate(town, result)["iou"] > 0.92  # the paper's figure
 
 
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [({"preset": "rivers"}, "did you mean 'river'"), ({"preset": ["park"]}, "valid string"),
-        ({"num_blocks": 6}, "raise size_m")],
-)  # fmt: skip
-def test_a_wrong_town_is_a_config_error(given, words):
-    with pytest.raises(ConfigError, match=words):
-        build(MapsConfig, {"synthetic": given}, "x")
-
-
 def node(name: str, x: float, y: float, yaw: float = 0.0, z: float = 0.0) -> dict:
     return {
         "id": f"GEN_{name}", "instance_name": name,
@@ -359,13 +348,6 @@ def test_courtyards_stay_open(tmp_path: Path):
     court = Point(20 - boxes.header.offset_m["x"], 20 - boxes.header.offset_m["y"])
     assert union.distance(court) > 7  # 10 m, less what a fill of 0.9 may take
     assert 1319.9 < union.area < 1320 / 0.9
-
-
-def test_surfaces_of_a_town_do_not_share_a_plane():
-    town = load_map(MapsConfig())
-    for one, other in combinations(("Roads", "Sidewalks", "RoadLines"), 2):
-        tops = [boxes_of(town, kind).maxs[:, 2] for kind in (one, other)]
-        assert abs(tops[0].max() - tops[1].max()) > 0.015
 
 
 def footprints(**attributes: object) -> Model:

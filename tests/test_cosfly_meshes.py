@@ -226,16 +226,6 @@ def test_what_nodes_repeat_is_counted_before_it_is_placed(tmp_path: Path) -> Non
         read_meshes(tmp_path / "scaled.glb", tree=tmp_path)
 
 
-def test_a_file_may_have_so_many_triangles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    trimesh.creation.icosphere(subdivisions=3).export(tmp_path / "fine.glb")
-    monkeypatch.setattr("cosfly.formats.mesh_files.MOST_TRIANGLES", 500)
-    with pytest.raises(InputError, match="over the limit"):
-        read_meshes(tmp_path / "fine.glb", tree=tmp_path)
-    monkeypatch.setattr("cosfly.formats.mesh_files.FILE_MB", 1e-3)
-    with pytest.raises(InputError, match="over the limit"):
-        read_meshes(tmp_path / "fine.glb", tree=tmp_path)
-
-
 def test_a_box_names_no_file_outside_of_its_folder(tmp_path: Path) -> None:
     path = tmp_path / "boxes_3d.json"
     write_boxes(path, map_of(("Static", (0, 0, 1), (1, 1, 1))))

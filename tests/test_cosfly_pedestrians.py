@@ -1,7 +1,6 @@
 """Stage 3: pedestrian trajectories, speeds and crossings, and bystanders about a pedestrian."""
 
 import json
-import math
 from pathlib import Path
 
 import cv2
@@ -16,13 +15,12 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths
 from cosfly.formats.roi import Roi
 from cosfly.geometry.axes import DT_S
-from cosfly.geometry.grid import OccupancyGrid
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.bystanders import bystanders_of, gaps_m
-from cosfly.pedestrians.speed_model import PACES, TimedRoute, standing_time_s, take_pace
-from cosfly.pedestrians.stage import PedestriansConfig, WalkableGround, make_pedestrian, run, walkable_ground
-from cosfly.pedestrians.walkable import costs_of, count_on_road
+from cosfly.pedestrians.speed_model import PACES, TimedRoute, take_pace
+from cosfly.pedestrians.stage import PedestriansConfig, make_pedestrian, run, walkable_ground
+from cosfly.pedestrians.walkable import count_on_road
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load, shipped
 from cosfly.runtime.errors import InputError
@@ -45,27 +43,6 @@ def town():
 def plain(size_m: float, *walls):
     half_m = size_m / 2
     return map_of(("Roads", (half_m, half_m, -0.1), (half_m, half_m, 0.1)), *(("Buildings", *wall) for wall in walls))
-
-
-def ground_in(parts: np.ndarray) -> WalkableGround:
-    grid = OccupancyGrid(0.0, 0.0, 1.0, parts == 0)
-    return WalkableGround(grid, grid, parts, np.zeros(parts.shape, np.uint8), 0.0, costs_of(1))
-
-
-@pytest.mark.parametrize("start", [(0, 0), (4, 2), (6, 6)])
-def test_goals_are_all_cells_of_the_part_at_the_wanted_distance(start):
-    rng = np.random.default_rng(1)
-    parts = rng.integers(0, 3, (8, 9)).astype(np.int32)
-    parts[start[1], start[0]] = 2
-    expected = {
-        (x, y)
-        for y, x in np.argwhere(parts == 2).tolist()
-        if 2.5 <= np.hypot(x - start[0], y - start[1]) <= 5.0
-    }  # fmt: skip
-    drawn = [ground_in(parts).sample_goals(start, 2.5, 5.0, rng)[0] for _ in range(200 * len(expected))]
-    assert set(drawn) == expected
-    counts = np.unique(np.array(drawn), axis=0, return_counts=True)[1]
-    assert abs(counts - 200).max() < 75  # 5 standard deviations
 
 
 def test_the_region_of_interest_bounds_every_walk():
@@ -121,27 +98,6 @@ def test_a_walk_keeps_every_promise(number, dt_s):
     assert not ground.grid.occupied[y, x].any()
     x, y = ground.grid.cells_at(path.polyline_m).T
     assert (ground.parts[y, x] == ground.parts[y[0], x[0]]).all()
-
-
-def test_a_detour_is_given_up_and_counted(monkeypatch):
-    # A wall of 90 m with a way round it at one end only: near the other end, 10 m across are 150 m on foot.
-    parts = np.ones((11, 100), dtype=np.int32)
-    parts[5, :95] = 0
-    ground = ground_in(parts)
-    cfg = PedestriansConfig(resolution_m=1.0, min_distance_m=4, max_distance_m=11, num_retries=50)
-    walks = [make_pedestrian("p", ground, cfg, np.random.default_rng(k)) for k in range(40)]
-    monkeypatch.setattr(PedestriansConfig, "max_detour", math.inf)
-    free_walks = [make_pedestrian("p", ground, cfg, np.random.default_rng(k)) for k in range(40)]
-
-    def worst(walks):
-        lines = [w.trajectory.polyline_m for w in walks]
-        return max(
-            np.linalg.norm(np.diff(p, axis=0), axis=1).sum() / np.linalg.norm(p[-1] - p[0]) for p in lines
-        )  # fmt: skip
-
-    assert worst(walks) <= 3.0 < worst(free_walks)
-    assert sum(w.num_rejected["detour"] for w in walks) > 0
-    assert sum(w.num_rejected["detour"] for w in free_walks) == 0
 
 
 def test_the_stage_writes_paths_report_and_picture(tmp_path):
@@ -356,12 +312,6 @@ def test_at_most_a_twentieth_of_the_walked_points_of_shipped_towns_is_on_the_roa
     assert paper > 0.1
 
 
-def test_a_route_that_ends_on_a_step_has_no_second_last_point():
-    time_s, positions, _ = TimedRoute(np.array([[0.0, 0.0], [1.0, 0.0]]), np.ones(2), np.zeros(2)).resample(0.5)
-    np.testing.assert_allclose(time_s, [0.0, 0.5, 1.0])
-    np.testing.assert_allclose(positions[-1], [1.0, 0.0])
-
-
 @settings(max_examples=40)
 @given(st.integers(0, 10**6), st.integers(2, 12))
 def test_samples_agree_with_a_walk_in_tiny_steps(seed, count):
@@ -384,22 +334,6 @@ def test_samples_agree_with_a_walk_in_tiny_steps(seed, count):
     np.testing.assert_allclose(sampled, np.interp(now_s, times, speeds), atol=1e-9)
     np.testing.assert_allclose(positions[[0, -1]], polyline[[0, -1]], atol=1e-9)
     assert np.linalg.norm(np.diff(positions, axis=0), axis=1).max() <= 1.6 * 0.5 + 1e-9
-
-
-@settings(max_examples=40)
-@given(st.integers(0, 10**6), st.integers(3, 10))
-def test_stops_change_when_a_place_is_reached_and_not_which(seed, count):
-    rng = np.random.default_rng(seed)
-    times = np.cumsum(rng.uniform(0.2, 3.0, count)) - 0.2
-    stops = rng.uniform(0.0, 5.0, count) * (rng.random(count) < 0.5)
-    fine_s = np.arange(0.0, times[-1] + stops.sum() + 1.0, 0.01)
-    stood = standing_time_s(fine_s, times, stops)
-    walked = fine_s - stood
-    assert (np.diff(stood) >= -1e-12).all()
-    assert (np.diff(walked) >= -1e-12).all(), "nobody goes back in time"
-    assert stood[-1] == pytest.approx(stops.sum())
-    for at, stop in zip(times, stops, strict=True):
-        assert (np.abs(walked - at) < 1e-9).sum() * 0.01 == pytest.approx(stop, abs=0.03)
 
 
 @settings(max_examples=60)

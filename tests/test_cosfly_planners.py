@@ -1,14 +1,11 @@
-"""Metrics on analytic curves, MuCO's terms and searches against plain versions, whole flights over hand-made maps, and the
-plan stage.
-"""
+"""MuCO's terms and the pedestrians' search against plain versions, whole flights over hand-made maps, the plan stage."""
 
-import itertools
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
@@ -16,7 +13,6 @@ from specimens_planning import (
     CANYON,
     WORLDS,
     assert_safe,
-    first_points,
     scenario_of,
     solved_by_scipy,
     town_of,
@@ -27,26 +23,16 @@ from specimens_planning import (
 import cosfly.planners.stage as planners
 from cosfly.formats.traces import read_traces
 from cosfly.geometry import kernels, trajectory_metrics
-from cosfly.geometry import trajectory_metrics as metrics
 from cosfly.geometry.axes import look_at
 from cosfly.geometry.grid import connected_parts
 from cosfly.pedestrians.astar import find_route, route_cost
-from cosfly.planners import foresight, smoothing, track_astar
-from cosfly.planners.contract import PlanConfig, Scenario, TrackAStarConfig
-from cosfly.planners.muco import loss, muco, nearby, step
+from cosfly.planners import foresight, smoothing
+from cosfly.planners.contract import PlanConfig, Scenario
+from cosfly.planners.muco import loss, muco, step
 from cosfly.planners.reference_trajectory import follow
 from cosfly.planners.stage import make_scenario, plan_on
 
 CFG = PlanConfig()
-
-
-def test_uniform_motion_is_perfectly_smooth():
-    line = np.outer(np.arange(50), [0.5, -0.2, 0.1])
-    assert metrics.derivative_rms(line, 2) == pytest.approx(0, abs=1e-12)
-    assert metrics.derivative_rms(line, 3) == pytest.approx(0, abs=1e-11)
-    assert metrics.smoothness_score(0, 0) == 1
-    assert metrics.length_m(line) == pytest.approx(49 * np.sqrt(0.3))
-    assert metrics.speed_max_mps(line) == pytest.approx(2 * np.sqrt(0.3))
 
 
 def plain_terms(points, problem, obstacles):
@@ -185,57 +171,6 @@ def straight_scenario(obstacles, length_m=30.0):
     return make_scenario(walk_along("w", [(0, 0), (length_m, 0)]), obstacles, CFG)
 
 
-def test_the_reference_places_are_in_the_lattice_and_cost_nothing():
-    scenario, _ = scenario_of("corner")
-    for climbing in (False, True):
-        made = foresight.make_lattice(scenario, climbing=climbing)
-        requested = scenario.reference.places_m(scenario.targets_m, scenario.ground_m)[made.frames]
-        ring = foresight.RINGS.index((0, 0))
-        np.testing.assert_allclose(made.places_m[:, ring, 0], requested, atol=1e-9)
-        assert (made.costs[:, ring, 0] == 0).all()
-        assert (np.delete(made.costs.reshape(len(requested), -1), ring * foresight.NUM_AZIMUTHS, axis=1) > 0).all()
-        assert (made.frames[0], made.frames[-1]) == (0, len(scenario.targets_m) - 1)
-        away_m = np.hypot(*(made.places_m - scenario.targets_m[made.frames, None, None])[..., :2].T)
-        assert made.radius_max_m == pytest.approx(away_m.max())
-
-
-def cheapest_by_trying_all(places, own, longest_m, index, clearance_m, links, num_azimuths, max_turn, way_cost):
-    """The least cost of any sequence of places, each step asked of the kernels."""
-    free = kernels.signed_distances(index, places.reshape(-1, 3), 50.0)[0].reshape(own.shape) >= clearance_m
-    cost = np.where(free[0], own[0], np.inf)
-    for key in range(1, len(places)):
-        now = np.full(len(cost), np.inf)
-        for c in np.flatnonzero(free[key]):
-            for b in np.flatnonzero(np.isfinite(cost)):
-                turn = abs(c % num_azimuths - b % num_azimuths)
-                length = np.linalg.norm(places[key, c] - places[key - 1, b])
-                if min(turn, num_azimuths - turn) > max_turn or b // num_azimuths not in links[c // num_azimuths]:
-                    continue
-                line = places[key - 1, b][None], places[key, c][None]
-                if length > longest_m[key] or kernels.segments_hit(index, *line, clearance_m)[0]:
-                    continue
-                now[c] = min(now[c], cost[b] + way_cost * length + own[key, c])
-        cost = now
-    return cost.min()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_no_sequence_of_places_is_cheaper(seed):
-    rng, num_azimuths, obstacles = np.random.default_rng(seed), 8, random_town(seed)
-    made = foresight.make_lattice(straight_scenario(obstacles, 6.0), climbing=False)
-    places = np.ascontiguousarray(made.places_m[:, :4, ::-4][:, :, :num_azimuths].reshape(len(made.frames), -1, 3))
-    own, links = rng.random(places.shape[:2]), made.links[:4, :].clip(max=4)
-    links = np.where(links < 4, links, -1)
-    links = np.array([sorted(row, key=lambda ring: ring < 0) for row in links])
-    gaps = kernels.signed_distances(obstacles, places.reshape(-1, 3), 12.0)[0].reshape(own.shape)
-    longest_m = np.full(len(places), 18.0)
-    settings = links, num_azimuths, 1, 0.02
-    chosen = foresight._cheapest(places, own, gaps, longest_m, obstacles, 3.0, *settings)
-    way, keys = places[np.arange(len(places)), chosen], np.arange(len(places))
-    cost = own[keys, chosen].sum() + 0.02 * np.linalg.norm(np.diff(way, axis=0), axis=1).sum()
-    assert cost == pytest.approx(cheapest_by_trying_all(places, own, longest_m, obstacles, 3.0, *settings))
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
     obstacles = random_town(seed)
@@ -270,66 +205,6 @@ def test_a_flight_is_planned_on_from_a_place_and_a_velocity(place_m, velocity_mp
     late = slice(len(flown) + 40, None)  # 20 s later it is where a flight of this style is, and sees the walker
     assert np.linalg.norm((points - targets)[late], axis=1).max() < 40
     assert kernels.visibility(obstacles, points, targets)[late].mean() > 0.95
-
-
-def cost_of(places, targets, obstacles, cfg, start):
-    """The cost of a sequence of places, straight from the docstring of the module."""
-    s, total = cfg.track_astar, 0.0
-    for k, (p, x) in enumerate(zip(places, targets, strict=True)):
-        aside, climb = np.hypot(*(p - x)[:2]) - cfg.behind_distance_m, p[2] - cfg.altitude_preferred_m
-        total += s.weight_tracking * np.hypot(aside, climb) / s.voxel_m
-        total += s.weight_visibility * (1 - kernels.visibility(obstacles, p[None], x[None])[0])
-        gap = kernels.signed_distances(obstacles, p[None])[0][0]
-        total += s.weight_safety * max(0, 1 - gap / s.influence_m) ** 2
-        total += s.weight_path * np.linalg.norm(p - (places[k - 1] if k else start)) / s.voxel_m
-        before = places[k - 1] - places[k - 2] if k > 1 else np.zeros(3)
-        total += s.weight_smoothness * (((p - places[k - 1] - before) / s.voxel_m) ** 2).sum() if k else 0.0
-    return total
-
-
-def exhaustive(voxels, targets, obstacles, cfg, start):
-    """The cheapest way over all cells and layers, without smoothness, by plain dynamic programming."""
-    cells = [c for c in itertools.product(*map(range, voxels.shape)) if voxels.columns[c[0], c[1]]]
-    places = voxels.low + np.array(cells) * voxels.size
-    free = kernels.signed_distances(obstacles, places)[0] >= cfg.safety_distance_m
-    steps = np.abs(np.array(cells)[:, None] - np.array(cells)[None]).max(axis=2) <= 1
-    starts, ends = np.nonzero(steps)
-    hit = kernels.segments_hit(obstacles, places[starts], places[ends], cfg.safety_distance_m)
-    way = np.full(steps.shape, np.inf)
-    way[starts, ends] = np.linalg.norm(places[starts] - places[ends], axis=1) / cfg.track_astar.voxel_m
-    way[starts[hit], ends[hit]] = np.inf
-
-    def own(target):
-        only = [cost_of(p[None], target[None], obstacles, cfg, p) for p in places]
-        return np.where(free, only, np.inf)
-
-    cost = own(targets[0]) + np.linalg.norm(places - start, axis=1) / cfg.track_astar.voxel_m
-    for target in targets[1:]:
-        cost = (cost[:, None] + way).min(axis=0) + own(target)
-    return cost.min()
-
-
-@pytest.mark.parametrize("world", ["tower_behind", "corner"])
-def test_a_wide_beam_finds_the_cheapest_way(world, monkeypatch):
-    coarse = {"voxel_m": 8.0, "voxel_height_m": 8.0, "corridor_m": 28.0, "weight_smoothness": 0.0}
-    for name, value in coarse.items():
-        monkeypatch.setattr(TrackAStarConfig, name, value)
-    box_map, corners = WORLDS[world]
-    obstacles = kernels.obstacle_index(box_map)
-    settings = TrackAStarConfig(beam=100000)
-    cfg = PlanConfig(altitude_max_m=40, relaxed_safety_m=3.0, track_astar=settings)
-    scenario = planners.make_scenario(walk_along(world, corners), obstacles, cfg)
-    scenario = first_points(scenario, 16)  # layers of three frames
-    raw, facts = track_astar.search_trajectory(scenario, obstacles, cfg, 3.0)
-    layers = np.arange(0, 16, track_astar.frames_per_layer(cfg))
-    targets = scenario.targets_m[layers]
-    ahead = (targets[1] - targets[0])[:2] / np.linalg.norm(targets[1] - targets[0])
-    start = np.array([*(targets[0, :2] - 20 * ahead), 20])
-    voxels = track_astar.make_voxels(scenario, cfg)
-    best = exhaustive(voxels, targets, obstacles, cfg, start)
-    assert facts["cost"] == pytest.approx(cost_of(raw[layers], targets, obstacles, cfg, start), abs=1e-6)
-    # The plain version grows boxes by the distance; the search, which measures first, may pass a corner more closely.
-    assert facts["cost"] <= best + 1e-6
 
 
 def shortest_costs(free: np.ndarray, start: tuple[int, int], classes: np.ndarray, costs: np.ndarray) -> np.ndarray:
@@ -392,32 +267,6 @@ def random_boxes(rng, count):
     rotations[:, 1, 0], rotations[:, 0, 1], rotations[:, 2, 2] = np.sin(turn), -np.sin(turn), 1.0
     centers = rng.uniform(-40, 40, (count, 3)) * [1, 1, 0.3] + [0, 0, 10]
     return kernels.index_boxes(centers, rng.uniform(0.2, 6, (count, 3)), rotations)
-
-
-@settings(max_examples=40)
-# The corner of a grown box, in a cell that the segment is further from than it grows.
-@example(seed=11876, count=400, far=False)
-@given(seed=st.integers(0, 10**6), count=st.sampled_from([0, 1, 8, 40, 400]), far=st.booleans())
-def test_memory_answers_as_the_index_does(seed, count, far):
-    rng = np.random.default_rng(seed)
-    index = random_boxes(rng, count)  # 400 boxes: more round a waypoint than there is room for
-    places, targets = rng.uniform(-40, 40, (2, 6, 3)) * [1, 1, 0.3] + [0, 0, 10]
-    memory = nearby.nothing_nearby(len(places))
-    assert nearby.num_cached(memory.anchors, memory.num_around, 0, *places[0]) == -1, "it knows nothing yet"
-    nearby.remember(memory, index, places, targets, 8.0, 0.8)
-    moves = rng.normal(size=places.shape)
-    moves *= (4.0 if far else rng.uniform(0, nearby.MARGIN_M)) / np.linalg.norm(moves, axis=1, keepdims=True)
-    room = np.empty(max(count, 1), dtype=np.int64)
-    for i, (p, x) in enumerate(zip(places + moves, targets, strict=True)):
-        gap, box = nearby.nearest_of(memory, i, index, *p, 8.0)
-        expected, nearest = kernels.nearest_box(index, *p, 8.0)
-        assert (gap, box < 0) == (expected, nearest < 0)
-        number = nearby.num_cached(memory.anchors, memory.num_on_view, i, *p)
-        wanted = set(room[: kernels.collect_hits(index, *x, *p, 0.8, room)].tolist())
-        if number >= 0:
-            assert not far
-            hits = nearby.hits_among(index.rows, memory.on_view, i, number, *x, *p, 0.8, room)
-            assert set(room[:hits].tolist()) == wanted
 
 
 def test_a_flight_does_not_depend_on_the_memory(monkeypatch):

@@ -1,7 +1,6 @@
 """Items to work: resume, tally, failures; workers that die, stall or never end; Ctrl-C while requests are in flight; the
 cache of compiled functions."""
 
-import asyncio
 import os
 import shutil
 import signal
@@ -16,7 +15,6 @@ from processes import QUICK, children_of, is_running, wait_until
 from toy_workers import items_of, make_faulty, stage_in
 
 import cosfly
-from cosfly.llm.contract import run_until_interrupted
 from cosfly.runtime.errors import EnvironmentMissing, InputError, StorageError
 from cosfly.runtime.events import LOSSES, read_events
 from cosfly.runtime.json_io import dump_json
@@ -311,24 +309,6 @@ def test_twice_ends_the_process_in_one_line():
     )
 
 
-def test_without_it_all_is_as_ever():
-    async def answer() -> int:
-        return 3
-
-    async def fail() -> None:
-        raise ValueError("as it is")
-
-    async def give_up() -> None:
-        raise asyncio.CancelledError
-
-    assert run_until_interrupted(answer()) == 3
-    with pytest.raises(ValueError, match="as it is"):
-        run_until_interrupted(fail())
-    with pytest.raises(asyncio.CancelledError):
-        run_until_interrupted(give_up())
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
 def make_package(root: Path) -> Path:
     package = root / "src" / "cosfly"
     package.mkdir(parents=True)
@@ -361,20 +341,3 @@ def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
         printed.append(done.stdout.split())
     assert printed == [["14", "0"], ["21", "0"], ["14", "1"]]  # what was compiled for the first sources is still there
     assert len(list((tmp_path / "cache" / "cosfly").iterdir())) == 2
-
-
-@pytest.mark.slow
-def test_compiling_is_told_once_and_loading_is_not(tmp_path):
-    (tmp_path / "two.py").write_text(
-        "import logging\nlogging.basicConfig(level=logging.INFO, format='%(message)s')\n"
-        "from cosfly.runtime.compiled import njit\n\n\n@njit(cache=True)\ndef f(x):\n    return x + 1\n\n\n"
-        "@njit(cache=True)\ndef g(x):\n    return x - 1\n\n\nf(1), g(1), f(1.5)\n"
-    )
-    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    said = [
-        subprocess.run(
-            [sys.executable, str(tmp_path / "two.py")], env=env, capture_output=True, text=True, check=True
-        ).stderr
-        for _ in range(2)
-    ]
-    assert (said[0].count("compiling kernels of __main__, once"), said[1]) == (1, "")

@@ -9,10 +9,8 @@ from test_renderers_contract import circling, write_inputs
 from toy_workers import make_counting_worker, stage_in
 
 from cosfly.pipeline.reproduce import (
-    OF_RELEASE,
     FigureReader,
     MissingFile,
-    read_paper,
     rendering_figures,
     watchdog_figures,
 )  # fmt: skip
@@ -25,8 +23,6 @@ from cosfly.runtime.run_dir import Manifest, Tally, read_manifest
 from cosfly.runtime.worker import Item
 from cosfly.studies.depth import study_of
 from cosfly.studies.zoom import enlarged_fov_deg
-from release.card.tables import all_tables
-from release.record import read_record
 
 NEAR_M, FAR_M = 15.36, 38.32  # tab:depth_format_comparison
 
@@ -117,44 +113,6 @@ def test_what_lost_workers_had_done_is_counted(tmp_path):
     events, manifest = read_events(tmp_path / "s"), read_manifest(tmp_path / "s")
     assert sum(event.steps for event in events if event.event == "worker_died") == 3
     assert watchdog_figures(events, manifest) == [2, 1, manifest.seconds, {"worker_died": 1}]
-
-
-# All labels of tables and figures in the paper.
-PAPER_FIGURES = """
-    appendix_g_editor appendix_g_excluded_regions appendix_g_projection appendix_h_alg3d_measured
-    appendix_h_alg3d_projections appendix_h_four_axis_bar appendix_h_measured_trajectory_grid
-    appendix_h_tastar_muco_deltas bertscore_comparison bertscore_distribution box_categories building_circling
-    caption_pipeline coc_lengths coc_sample_frame confusion_matrix confusion_patterns consistency_verdict
-    cosfly_matrix_world_failure cumulative_trajectories dataset_sample decision_accuracy depth_comparison
-    dual_trajectory_pipeline fig17_stage_breakdown fig18_render_scaling fig19_watchdog gpu_utilization
-    grid_simplification joint_perturbation pedestrian_trajectory_generation per_map_completion
-    pipeline_flowchart pipeline_overview regen_strategy sample_generation simulator_restarts simworld_pipeline
-    simworld_step1 simworld_step2 simworld_step5 simworld_step6 sliding_window system_resources teaser
-    trajectory_comparison weather_gallery weather_pipeline zoom_demo zoom_fidelity
-"""
-PAPER_TABLES = """
-    algo_comparison appendix_h_extended_feasibility appendix_h_extended_ranking appendix_h_four_axis_scores
-    appendix_h_group_summary appendix_h_scope appendix_h_tastar_muco_delta appendix_h_tastar_muco_win_rates
-    augmentation_params augmentation_states baseline_protocol box_categories boxes_schema caption_pipeline
-    coc_actions coc_sample_en coc_sample_zh dataset_format_survey depth_format_comparison dist_stats
-    distillation_summary drone_params machine_configs ped_params planner_dist quality_stats render_scaling
-    simworld_simplify simworld_step4 simworld_step6_cli stage_breakdown tod_presets watchdog_reliability
-    weather_cli weather_coverage weather_heatmap weather_meta weather_modes weather_params_fields
-    weather_presets zoom_config zoom_conversion zoom_eval
-"""
-LABELS = [f"fig:{name}" for name in PAPER_FIGURES.split()] + [f"tab:{name}" for name in PAPER_TABLES.split()]
-
-
-def test_every_table_and_figure_of_the_paper_is_told_or_left_out_with_why(built):
-    paper = read_paper()
-    told = [*paper.settings, *paper.tables, *(table.more_labels for table in paper.tables.values())]
-    papers = {table.key: table.paper for table in all_tables(read_record(built / "release.json"))}
-    told += [papers[key] for key in OF_RELEASE]
-    left = [label for labels in paper.left_out for label in labels.split(", ")]
-    both = {label for labels in told for label in labels.split(", ")}
-    assert (sorted(set(LABELS) - both - set(left)), sorted(both & set(left))) == ([], [])
-    assert sorted(label for label in {*both, *left} - set(LABELS) if label.startswith(("tab:", "fig:"))) == []
-    assert all(paper.left_out.values())
 
 
 def test_figures_are_found_by_keys_numbers_ids_and_stars(tmp_path):

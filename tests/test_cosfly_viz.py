@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from browser import browser
-from commands import invoke, obeyed
+from commands import obeyed
 from PIL import Image
 from specimens_captions import VOCABULARY
 from specimens_distill import WINDOW, make_caption
@@ -295,10 +295,3 @@ def test_four_pictures_of_a_frame(street_tree, tmp_path):
     assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), np.asarray(Image.open(tmp_path / "b.png")))
     with pytest.raises(InputError):
         four_panels(street_tree, tmp_path / "a.png", frame="../../elsewhere", box_map=street())
-
-
-def test_a_frame_without_a_map_is_one_clear_error(tmp_path):
-    tmp_path.joinpath("tree").mkdir()
-    result = invoke("view", tmp_path / "tree", "--frame best --out", tmp_path / "a.png")
-    assert result.exit_code == 2
-    assert "--map" in result.output

@@ -184,14 +184,6 @@ def test_a_window_that_is_captioned_twice_is_refused(tree, tmp_path):
         prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
 
 
-def test_with_few_walks_train_comes_first(tmp_path, caplog):
-    tree = make_playback_tree(tmp_path / "tree", 2, 8)
-    make_captions(tmp_path / "captions.jsonl", tree)
-    out = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
-    assert [len(open_split(out, split)) > 0 for split in SPLITS] == [True, True, False]
-    assert "the split test is empty" in caplog.text
-
-
 def test_a_limit_keeps_so_many_windows_whole_and_more_with_a_larger_limit(tree, captions, tmp_path):
     def kept(limit: int) -> dict[str, set[str]]:
         out = prepared(tree, captions, tmp_path / str(limit), limit=limit)

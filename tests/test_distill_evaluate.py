@@ -358,16 +358,3 @@ def test_an_evaluation_with_an_encoder_names_it(place, encoder):
     assert report.languages["en"].who["majority"].figures["values_matched"].value is None
     rows = [row[0] for row in tables_of(report, "en")[0].rows]
     assert f"BERTScore F1 ({encoder.parent.name}/encoder layer 3)" in rows
-
-
-@pytest.mark.parametrize(("name", "config", "words"), [
-    ("empty", None, "no encoder that the library"), ("unknown", '{"model_type": "no_such_model"}', "cannot be loaded"),
-    ("t5-small", "{}", "T5"),
-])  # fmt: skip
-def test_a_folder_that_is_no_encoder_is_named(tmp_path, name, config, words):
-    folder = tmp_path / name
-    folder.mkdir()
-    if config is not None:
-        (folder / "config.json").write_text(config)
-    with pytest.raises(InputError, match=words):
-        Scorer(folder, ["a text"])

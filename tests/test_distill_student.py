@@ -1,9 +1,7 @@
 """A student: its chat templates, merged weights, fused norms and the chunked loss, each against the libraries'.
 
-The templates here were written for these tests; they branch where the public ones of Qwen3.5, 3.6 and 3.8 do: texts
-are trimmed, thoughts of the last answer are kept and others dropped, 3.6 can keep them (`preserve_thinking`), 3.8 keeps
-them unless told otherwise, takes thoughts from their own field alone, and begins its system text with how much to think
-unless thinking is off.
+The template here was written for these tests; it branches where the public one of Qwen3.8 does: texts are trimmed,
+thoughts come from their own field, and the system text begins with how much to think unless thinking is off.
 """
 
 import shutil
@@ -53,21 +51,13 @@ TEMPLATE = """
         {%- endfor -%}
     {%- endif -%}
 {%- endmacro -%}
-{%- set place = namespace(last_question=-1) -%}
-{%- for message in messages if message.role == 'user' -%}
-    {%- set place.last_question = messages.index(message) -%}
-{%- endfor -%}
-{%- set effort = '' -%}
-EFFORT
 {%- for message in messages -%}
     {%- set text = words(message.content) | trim -%}
-    {%- if message.role == 'system' and effort -%}{%- set text = effort + '\\n\\n' + text -%}{%- endif -%}
-    {%- if message.role == 'assistant' -%}
+    {%- if message.role == 'system' and (enable_thinking is undefined or enable_thinking is true) -%}
+        {%- set text = 'Reasoning effort is set to xhigh.\\n\\n' + text -%}
+    {%- elif message.role == 'assistant' -%}
         {%- set thought = message.reasoning_content if message.reasoning_content is string else '' -%}
-        FROM_TEXT
-        {%- if KEEPS or loop.index0 > place.last_question -%}
-            {%- set text = '<think>\\n' + (thought | trim) + '\\n</think>\\n\\n' + text -%}
-        {%- endif -%}
+        {%- set text = '<think>\\n' + (thought | trim) + '\\n</think>\\n\\n' + text -%}
     {%- endif -%}
     {{- '<|im_start|>' + message.role + '\\n' + text + '<|im_end|>\\n' -}}
 {%- endfor -%}
@@ -76,35 +66,11 @@ EFFORT
     {%- if enable_thinking is defined and enable_thinking is false -%}{{- '\\n</think>\\n\\n' -}}{%- endif -%}
 {%- endif -%}
 """
-FROM_TEXT = """
-        {%- if not thought and '</think>' in text -%}
-            {%- set thought = text.split('</think>')[0].split('<think>')[-1] -%}
-            {%- set text = text.split('</think>')[-1].lstrip('\\n') -%}
-        {%- endif -%}"""
-EFFORT = """
-{%- if enable_thinking is undefined or enable_thinking is true -%}
-    {%- set effort = 'Reasoning effort is set to ' ~ (reasoning_effort | default('xhigh')) ~ '.' -%}
-{%- endif -%}"""
 
 
-def template(keeps_thoughts: str, from_text: str = FROM_TEXT, effort: str = "") -> str:
-    return TEMPLATE.replace("KEEPS", keeps_thoughts).replace("FROM_TEXT", from_text).replace("EFFORT", effort)
-
-
-TEMPLATES = {
-    "3.5": template("false"),
-    "3.6": template("(preserve_thinking is defined and preserve_thinking)"),
-    "3.8": template("(preserve_thinking | default(true))", "", EFFORT),
-}
-
-
-@pytest.fixture(params=TEMPLATES)
-def processor(place, request) -> Processor:
+def test_prompt_answer_and_end_are_the_whole_chat(place):
     own = load(place)
-    return Processor(own.tokenizer, own.library, TEMPLATES[request.param])
-
-
-def test_prompt_answer_and_end_are_the_whole_chat(place, processor):
+    processor = Processor(own.tokenizer, own.library, TEMPLATE)
     assert processor.end_of_answer == "<|im_end|>\n"
     for sample in samples_of(place)[:4]:
         prompt = processor.prompt_text(sample)

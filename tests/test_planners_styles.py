@@ -22,9 +22,8 @@ from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import walkable_ground
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.contract import PLANNERS, PlanConfig
-from cosfly.planners.maneuver_plan import draw_maneuvers
 from cosfly.planners.reference_trajectory import finds_again
-from cosfly.planners.stage import draw_styles_of, make_scenario, plan_trajectory, screens_of, style_rng
+from cosfly.planners.stage import draw_styles_of, plan_trajectory, screens_of
 from cosfly.planners.styles import FOLLOW, NAMES, REACQUIRE, RETURN_HOME, TABLE
 from cosfly.render.camera import view_target
 from cosfly.runtime.config import load, shipped
@@ -97,13 +96,6 @@ def test_every_planner_flies_every_style_safely(planner, style):
     assert trace.as_json() == DroneTrace.from_json(trace.as_json(), "w").as_json()
     if style == FOLLOW:
         assert trace.as_json().keys().isdisjoint({"segments", "mission", "instead_of"})
-
-
-def test_the_default_is_the_papers_flight_and_draws_nothing():
-    scenario = make_scenario(STRAIGHT, OPEN, PlanConfig())
-    intent = draw_maneuvers([FOLLOW], scenario, OPEN, OPEN, PlanConfig(), style_rng(STRAIGHT, 0))
-    assert intent.reference is scenario.reference
-    assert (intent.segments, intent.mission, intent.impossible) == ((), None, None)
 
 
 def test_parts_draw_their_styles_and_cover_the_flight():

@@ -28,61 +28,15 @@ from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.geometry.goals import SIDES, SLOTS, words_of
-from cosfly.geometry.trajectory_metrics import derivative_rms, length_m
 from cosfly.runtime.json_io import read_json
 from release.card.render import render_card
-from release.card.tables import tables_of
-from release.columns import CAPTION_FIELDS, CONTRACT, COUNTED, POINT, POSE, SCALAR_NAMES, SCALARS, Placement
-from release.counting import Sum, action_class, count_track, numbers_of
+from release.columns import CONTRACT, SCALARS, Placement
+from release.counting import action_class
 from release.reading import Row, TrackRows
 from release.record import read_record
 from release.rules import select_frames
 from release.verify.findings import Findings
 from release.verify.scene import check_goal, decode
-
-WORDS = {
-    "decision": "hover", "label": "ascend", "label_from": "flight", "verdict": "SOFT_CONFLICT", "teacher_kind": "rules",
-}  # fmt: skip
-
-
-def make_row(i: int, variant: str = "ORI", trajectory: str = "trajectory_1", **change) -> dict:
-    """A frame of a drone that flies 3 m a frame to the east, 20 m above a person; the perturbed track 1 m beside."""
-    shift = 0.0 if variant == "ORI" else (-1.0) ** i
-    place = {"x_m": 3.0 * i, "y_m": shift, "z_m": 20.0}
-    row = dict.fromkeys(SCALAR_NAMES) | {
-        "sample_id": f"{trajectory}_{variant}_frame_{i:05d}", "run": "one", "town": "Town01",
-        "trajectory": trajectory, "variant": variant,
-        "track": "clean" if variant == "ORI" else "perturbed", "style": "follow", "pace": "walk",
-        "frame_index": i, "time_s": 0.5 * i,
-        "width_px": 64, "height_px": 36, "fov_deg": 60.0, "pose": dict.fromkeys(POSE, 0.0) | place,
-        "drone_offset": dict.fromkeys(POSE, 0.0) | {"y_m": shift},
-        "target": dict(zip(POINT, (3.0 * i, 0.0, 0.0), strict=True)),
-        "visibility": 0.75, "is_perturbed": variant != "ORI", "target_in_view": True,
-        "target_visible": True, "has_caption": i % 2 == 0,
-    }  # fmt: skip
-    if row["has_caption"]:
-        row |= dict.fromkeys((*COUNTED, *CAPTION_FIELDS), "word") | WORDS | {"values_filled_en": 2}
-    return row | change
-
-
-TRACKS = [
-    TrackRows(f"one/Town01/trajectory_{k}/{variant}", [make_row(i, variant, f"trajectory_{k}") for i in range(12)])
-    for k in (1, 2)
-    for variant in ("ORI", "aug_001")
-]
-
-
-def test_a_trajectory_counts_once_and_is_as_long_as_it_is_without_perturbation():
-    tracks = [count_track(rows, rows) for rows in TRACKS]
-    numbers = numbers_of(tracks, 12)
-    assert (numbers.flights, numbers.trajectories, numbers.frames) == (4, 2, 48)
-    length = numbers.spreads["trajectory_length_m"].model_dump()
-    assert length == {"count": 2, "mean": 33.0, "std": 0.0, "min": 33.0, "max": 33.0}
-
-
-@given(st.lists(st.floats(-1e6, 1e6), max_size=30), st.integers(0, 30))
-def test_values_added_in_pieces_give_the_same_sum(values, cut):
-    assert Sum.all([Sum.of(values[:cut]), Sum.of(values[cut:])]) == Sum.of(values)
 
 
 def test_the_class_of_an_action():
@@ -124,16 +78,6 @@ def test_so_many_frames_in_order(num_points, num_frames, window):
         assert (chosen[0], chosen[-1]) == (0, num_points - 1)
 
 
-@given(st.integers(300, 3000), st.integers(1, 800), st.integers(1, 12))
-def test_runs_and_the_gaps_between_them_differ_by_one_at_most(num_points, num_frames, window):
-    chosen = select_frames(num_points, num_frames, "windows", window)
-    gaps = np.diff(chosen)[np.diff(chosen) > 1]
-    if len(gaps) and num_points - num_frames >= len(gaps) + 1 and gaps.min() > 2:  # no two runs have grown together
-        lengths = [len(run) for run in np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)]
-        assert max(lengths) - min(lengths) <= 1
-        assert gaps.max() - gaps.min() <= 1
-
-
 @given(st.integers(0, 3000), st.integers(1, 800))
 def test_the_stride_is_that_of_the_paper(num_points, num_frames):
     chosen = select_frames(num_points, num_frames, "stride", 5)
@@ -162,31 +106,6 @@ def test_the_coordinates_state_the_constants_of_the_code():
     assert all(limit in CONTRACT["legibility"] for limit in limits)
 
 
-def rows_of(positions: np.ndarray, frames: list[int], offsets: np.ndarray | None = None) -> list[dict]:
-    """Rows at some frames of a flight, perturbed by known offsets."""
-    offsets = np.zeros_like(positions) if offsets is None else offsets
-
-    def at(place: np.ndarray) -> dict[str, float]:
-        return dict.fromkeys(POSE, 0.0) | dict(zip(POINT, place.tolist(), strict=True))
-
-    nothing = dict.fromkeys(POINT, 0.0)
-    return [
-        make_row(i, "aug_001", pose=at(positions[i] + offsets[i]), drone_offset=at(offsets[i]), target_offset=nothing)
-        for i in frames
-    ]
-
-
-@given(seed=st.integers(0, 99), num=st.integers(4, 30))
-def test_motion_is_that_of_the_plan_whatever_the_perturbation(seed, num):
-    rng = np.random.default_rng(seed)
-    plan = np.cumsum(rng.normal(0, 1, (num, 3)), axis=0)
-    rows = TrackRows("one/Town01/trajectory_1/aug_001", rows_of(plan, list(range(num)), rng.normal(0, 2, (num, 3))))
-    flight = count_track(rows, rows)
-    assert flight.motion["length_m"] == pytest.approx(length_m(plan), rel=1e-9)
-    assert flight.motion["accel_rms_mps2"] == pytest.approx(derivative_rms(plan, 2), rel=1e-6)
-    assert flight.motion["jerk_rms_mps3"] == pytest.approx(derivative_rms(plan, 3), rel=1e-6)
-
-
 def test_the_statistics_are_those_of_the_rows(built, tmp_path):
     obeyed("release stats", built.parent, "--out", tmp_path)
     written = read_json(tmp_path / "stats.json")["tables"]
@@ -210,15 +129,6 @@ def test_the_statistics_are_those_of_the_rows(built, tmp_path):
     for outside in ("<script", 'src="http', "://"):
         assert outside not in page
     assert "<title>one</title>" in page  # the run's name
-
-
-def test_odd_numbers_of_a_record_make_tables_of_whole_rows(built):
-    record = read_record(built / "release.json")
-    odd = {key: {"x": 3} for key in ("sky", "confusion", "events", "fov", "step_s", "decision")}
-    for counts in ({}, record.numbers.counts | odd):
-        numbers = record.numbers.model_copy(update={"counts": counts, "spreads": {}})
-        for table in tables_of(record.model_copy(update={"numbers": numbers})):
-            assert {len(row) for row in table.rows} == {len(table.head)}, table.key
 
 
 @pytest.fixture(scope="module")

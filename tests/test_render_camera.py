@@ -19,7 +19,6 @@ from cosfly.formats.frames import (
     read_meta,
     read_rgb,
 )
-from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback_file import read_track, write_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.formats.weather import TIMES, WEATHERS, WeatherParams, resolved
@@ -40,14 +39,6 @@ from specimens import change_json, make_flight
 LEVELS = (110.0, 90.0, 60.0, 30.0)
 SMALL = {"width_px": 160, "height_px": 90, "town": "Street", "first_timestamp": 1776000000}
 DYNAMIC = {"mode": "dynamic", "part_s": 2.0, "ramp_s": 1.0}
-
-
-def test_a_field_of_view_outside_0_to_180_is_an_error_and_any_inside_is_taken():
-    for fov in (0.0, -30.0, 180.0, 200.0, float("nan")):
-        with pytest.raises(ConfigError, match=r"fovs_deg"):
-            build(RenderConfig, {"fovs_deg": [90.0, fov]}, "test")
-    for fov in (0.1, 179.0):
-        assert build(RenderConfig, {"fovs_deg": [fov]}, "test").fovs_deg == (fov,)
 
 
 def test_a_flight_goes_from_level_to_level():
@@ -173,13 +164,9 @@ def test_a_bad_pool_is_one_error_with_all_its_problems(tmp_path):
     many = ["a.cloudiness", "presets.a.precipitation", "finite", "a.fog_density", "a.fog_distance", "4 to fix"]
     outside = "cloudiness: 101, precipitation: .nan, fog_density: -1, fog_distance: 0"
     for text, words in (
-        ("presets: {a: {cloudiness: 1, fog_density: 5, fog_distance: 9}}", ["presets.a.precipitation", "required"]),
         (f"presets: {{a: {{{outside}}}}}", many),
-        (f"presets: {{a: {{cloudyness: 1, {rest}}}", ["did you mean 'cloudiness'"]),
-        (f"presets: {{a: {{cloudiness: on, {rest}}}", ["presets.a.cloudiness"]), ("presets: {}", ["presets"]),
-        ("{}", ["presets"]), ("presets: [1]", ["presets"]),
+        ("presets: {}", ["presets"]),
         (f"presets: {{a b: &x {{cloudiness: 1, {rest}, a_b: *x}}", ["two presets have the same name"]),
-        ("!!python/object:os.system {}", ["tag"]),
     ):  # fmt: skip
         sky.write_text(text)
         with pytest.raises(ConfigError) as caught:
@@ -189,8 +176,6 @@ def test_a_bad_pool_is_one_error_with_all_its_problems(tmp_path):
     with pytest.raises(ConfigError) as caught:
         read_pools(config(**RANDOM, tod_pool=str(tod)))
     assert all(word in str(caught.value) for word in ("tod.yaml", "sun_altitude_angle", "sun_azimuth_angle"))
-    with pytest.raises(ConfigError, match=r"none\.yaml"):
-        read_pools(config(**RANDOM, weather_pool=str(tmp_path / "none.yaml")))
 
 
 def params(weather: str = "clear", time: str = "noon", **knobs: float) -> WeatherParams:
@@ -275,20 +260,6 @@ def test_records_stand_in_every_file_and_labels_are_those_of_fair_weather(trees)
             target = meta.target.model_copy(update={k: getattr(fair.target, k) for k in ("contrast", "legible")})
             fair_again = meta.model_copy(update={"weather": None, "look": fair.look, "target": target})
             assert fair_again.model_dump() == fair.model_dump()
-
-
-def test_rain_falls_and_wets_the_road(renderer):
-    dry = params("overcast", fog_density=0, precipitation=0)
-    wet = dry.model_copy(update={"precipitation": 90.0})
-    before, after = drawn(renderer, dry), drawn(renderer, wet)
-    sky = before.kinds == KINDS["Sky"]
-    assert after.rgb[sky].astype(float).std() > before.rgb[sky].astype(float).std(), "streaks"
-    above = pose_towards((0.0, -1.0, 12.0), (0.0, 0.0, 0.0))
-    road = [drawn(renderer, knobs, above) for knobs in (dry, wet)]
-    where = road[0].kinds == KINDS["Roads"]
-    assert np.median(road[1].rgb[where]) < 0.85 * np.median(road[0].rgb[where]), "darker from above"
-    moved = drawn(renderer, wet, pose_towards((-14.0, -16.0, 8.01), (12.0, 2.0, 2.0)))
-    assert (moved.rgb[:20] != after.rgb[:20]).any(), "drops fall anew in another frame"
 
 
 def test_the_towns_of_a_run_have_weather_seeds_of_their_own():

@@ -8,8 +8,6 @@ import re
 import subprocess
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parents[1]
 USER_WORDS = "cosfly/worldgen/words.yaml"  # the words of prompts
 TO_REWRITE = ("tests/",)
@@ -86,15 +84,3 @@ def test_banned_words_are_not_used():
         if (words := banned_words(line))
     ]
     assert wrong == []
-
-
-@pytest.mark.parametrize(
-    ("source", "word"), [('def f():\n    """Give it."""', "Give"), ('async def f():\n    """Whether."""', "Whether")]
-)
-def test_a_wrong_first_word_is_found(source, word):
-    assert first_words(source) == [("f", word)]
-    assert word not in VERBS
-
-
-def test_a_banned_word_is_found():
-    assert banned_words("Ask it anew, beside the one of before.") == ["anew", "beside", "of before"]

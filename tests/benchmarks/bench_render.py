@@ -2,15 +2,12 @@
 
     python tests/benchmarks/bench_render.py --frames 24                    # one process, no workers
 
-1280x720, all files, the synthetic town and the SimWorld city, flights of the default planner. On a
-machine with a GPU the same commands use it (the device is printed).
+1280x720, the synthetic town, a flight of the default planner. On a machine with a GPU the same command uses it (the
+device is printed).
 """
 
 import argparse
-import tempfile
 from collections import Counter
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -18,13 +15,11 @@ import numpy as np
 import scenes
 
 from cosfly.formats import frames
-from cosfly.formats.boxes import read_boxes, write_boxes
-from cosfly.formats.traces import DroneTrace, read_traces, write_traces
+from cosfly.formats.traces import DroneTrace
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.geometry.kernels import obstacle_index
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_trajectory
-from cosfly.render import track as flight
 from cosfly.render.contract import PERSON_ID
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.stage import open_renderer
@@ -32,22 +27,6 @@ from cosfly.render.track import MARGIN_M
 
 SIZE = (1280, 720)
 FOVS_DEG = (60.0, 90.0)
-FILES = ("boxes_3d.json", "drone_trace.json")
-
-
-def make_inputs(root: Path) -> dict[str, Path]:
-    folders = {}
-    for name, raw in (("town", scenes.town()), ("city", scenes.city())):
-        if raw is None:
-            continue
-        simple, cfg = scenes.simplified(raw), PlanConfig()
-        (walk,) = scenes.walks_on(simple, num_paths=1)
-        trace = plan_trajectory(walk, obstacle_index(simple), cfg, scenes.SEED)
-        folders[name] = root / name
-        folders[name].mkdir()
-        write_boxes(folders[name] / FILES[0], raw)
-        write_traces(folders[name] / FILES[1], [replace(trace, drop_reason=None)], {})
-    return folders
 
 
 def views(trace: DroneTrace, num_frames: int) -> list[tuple]:
@@ -60,7 +39,7 @@ def views(trace: DroneTrace, num_frames: int) -> list[tuple]:
 
 
 class Parts:
-    """Processor time by name, of calls that do not overlap."""
+    """Processor time by name."""
 
     def __init__(self) -> None:
         self.used_ms: Counter[str] = Counter()
@@ -74,42 +53,26 @@ class Parts:
         return timed
 
 
-def parts(folder: Path, num_frames: int) -> tuple[str, list[Any]]:
-    """One process draws and writes frames one after the other. Gives the device and ms a frame."""
-    (trace,) = read_traces(folder / FILES[1])
-    renderer: Any = open_renderer("gl", read_boxes(folder / FILES[0]), *SIZE)
+def measure(renderer: Any, trace: DroneTrace, num_frames: int) -> list[float]:
+    """Draw and encode frames one after the other; return ms a frame of drawing, reading back and both pictures."""
     places = np.concatenate([trace.positions_m, trace.targets_m])
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M)
-    todo = views(trace, num_frames)
+    todo, measured = views(trace, num_frames), Parts()
     for view in todo[:: max(1, num_frames // 6)]:
         renderer.render(*view)  # compiles what this flight needs
-    measured = Parts()
-    plain = renderer.render, renderer._read, renderer.context.finish
+    plain = renderer._read
 
     def read() -> Any:
-        plain[2]()
-        return measured.of("read back, soften, split", plain[1])()
+        renderer.context.finish()
+        return measured.of("read", plain)()
 
     renderer._read = read
-    with tempfile.TemporaryDirectory() as scratch:
-        for number, view in enumerate(todo):
-            frame = measured.of("render", plain[0])(*view)
-            contents = [
-                measured.of("PNG of colours", frames.rgb_bytes)(frame.rgb),
-                measured.of("PNG of kinds and ids", frames.instance_bytes)(frame.kinds, frame.ids),
-                measured.of("depth packed", frames.depth_file)(frame.depth, "png")[1],
-            ]
-            for k, data in enumerate(contents):
-                measured.of("hash", flight.sha256_bytes)(data)
-                measured.of("write", Path(scratch, f"{number}_{k}").write_bytes)(data)
-    device = renderer.device
-    renderer.close()
+    for view in todo:
+        frame = measured.of("render", renderer.render)(*view)
+        measured.of("colours", frames.rgb_bytes)(frame.rgb)
+        measured.of("ids", frames.instance_bytes)(frame.kinds, frame.ids)
     used = measured.used_ms
-    used["draw"] = used.pop("render") - used["read back, soften, split"]
-    names = (
-        "draw", "read back, soften, split", "PNG of colours", "PNG of kinds and ids", "depth packed", "hash", "write",
-    )  # fmt: skip
-    return device, [used[name] / num_frames for name in names]
+    return [one / num_frames for one in (used["render"] - used["read"], used["read"], used["colours"], used["ids"])]
 
 
 def main() -> None:
@@ -118,12 +81,15 @@ def main() -> None:
     given = parser.parse_args()
     scenes.one_thread_and_machine()
     cv2.setNumThreads(1)
-    with tempfile.TemporaryDirectory() as root:
-        folders = make_inputs(Path(root))
-        found = {name: parts(folder, given.frames) for name, folder in folders.items()}
-    names = ["map", "draw", "read", "PNG rgb", "PNG ids", "npy", "hash", "write", "sum"]
-    rows = [[name, *used, sum(used)] for name, (_, used) in found.items()]
-    scenes.print_table(f"CPU ms a frame, {next(iter(found.values()))[0]}", names, rows)
+    raw = scenes.town()
+    simple = scenes.simplified(raw)
+    (walk,) = scenes.walks_on(simple, num_paths=1)
+    trace = plan_trajectory(walk, obstacle_index(simple), PlanConfig(), scenes.SEED)
+    renderer = open_renderer("gl", raw, *SIZE)
+    row = measure(renderer, trace, given.frames)
+    names = ["draw", "read back, soften, split", "PNG of colours", "PNG of kinds and ids", "sum"]
+    scenes.print_table(f"CPU ms a frame, {renderer.device}", names, [[*row, sum(row)]])
+    renderer.close()
 
 
 if __name__ == "__main__":
