@@ -223,7 +223,7 @@ def _group(model: Any, parents: Iterable[Any]) -> Any:
 
 
 def shipped(name: str) -> Path:
-    """Return the path of a file that ships in `configs/`: inside an installed package, beside it in a checkout."""
+    """Return the path of a file that ships in `configs/`: inside an installed package, next to it in a checkout."""
     package = Path(__file__).parents[1]
     installed = package / "configs"
     return (installed if installed.is_dir() else package.with_name("configs")) / name

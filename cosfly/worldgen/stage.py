@@ -19,7 +19,7 @@ from cosfly.llm.contract import NoAnswer, Reply, started
 from cosfly.maps.footprints import footprints
 from cosfly.maps.simworld import PLACEHOLDER_CM
 from cosfly.runtime.config import Config, read_yaml, shipped
-from cosfly.runtime.errors import InputError, TeacherError
+from cosfly.runtime.errors import InputError, TeacherError, counts_text
 from cosfly.runtime.io import sha256_bytes, write_bytes
 from cosfly.runtime.json_io import FileFormat, validated, write_json, write_model
 from cosfly.runtime.model_json import find_object
@@ -192,6 +192,8 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     _write_settings(cfg.name, product, out / LOOP_FILE)
     if problems := _problems(checks, town, trace):
         log.warning("%s", problems)
+    if town.placed:
+        log.info("placed: %s", counts_text(Counter(thing.name for thing in town.placed)))
     num_kept = 1 + len(town.placed)
     dropped = Counter(reason.replace(" ", "_") for _, reason in town.not_placed)
     tally = Tally(input=num_kept + len(town.not_placed), kept=num_kept, dropped=dropped)
@@ -203,12 +205,17 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
 
 
 def _picture(town: Town, plan: WorldPlan) -> bytes:
-    """Draw a town from above, with names on its open blocks, as PNG bytes."""
+    """Draw a town from above, with the names of its open blocks and objects, as PNG bytes."""
     view = TopView.around(np.stack(town.boxes.bounds()), PICTURE_PX)
     picture = draw_map(town.boxes, view)
-    for index, block in enumerate(town.open_blocks):  # plazas first; their pavement is that of other blocks
-        name = "plaza" if index < plan.plazas else "green"
-        draw_text(picture, name, *view.pixels(np.array(block.centroid.coords))[0], align=0.5, halo=HALO)
+    block_names = ["plaza"] * plan.plazas + ["green"] * plan.greens  # in the order of the open blocks
+    things = [thing for thing in town.placed if OBJECTS[thing.name].where != "layout"]
+    labels = [(thing.name, thing.xy) for thing in things if thing.number == 0]
+    for name, block in zip(block_names, town.open_blocks, strict=False):
+        if not any(block.covers(shapely.Point(thing.xy)) for thing in things):
+            labels.append((name, block.centroid.coords[0]))
+    for name, xy in labels:
+        draw_text(picture, name, *view.pixels(np.array([xy]))[0], align=0.5, halo=HALO)
     return png_bytes(picture)
 
 

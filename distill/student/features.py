@@ -150,7 +150,7 @@ def _encode_together(student: Student, pictures: Sequence[Tensors]) -> list[Tens
 
 @contextlib.contextmanager
 def with_encoded_pictures(student: Student, features: Sequence[Tensors]) -> Iterator[dict[str, Any]]:
-    """Let the model's own forward use the features of pictures instead of encoding them; yield its further inputs.
+    """Make the model's own forward use the features of pictures instead of encoding them; yield its further inputs.
 
     That relies on three facts of transformers' families with pictures: forward calls the model's method
     `get_image_features` if it gets `pixel_values`; it uses the pixels for nothing else; and an attribute of the
