@@ -132,13 +132,11 @@ def count_track(frames: TrackRows, points: TrackRows) -> TrackCount:
     is_zooming = bool((np.abs(fovs - fovs[0]) > SAME_FOV_DEG).any())
     captioned = [row for row in rows if row["has_caption"]]
     measured = {
-        "height_m": to_drone_m[:, 2],
-        "distance_m": np.linalg.norm(to_drone_m, axis=1),
-        "clean_altitude_m": clean_m[:, 2] + TARGET_HEIGHT_M,
-        "clean_distance_m": np.linalg.norm(clean_m, axis=1),
+        "height_m": to_drone_m[:, 2], "distance_m": np.linalg.norm(to_drone_m, axis=1),
+        "clean_altitude_m": clean_m[:, 2] + TARGET_HEIGHT_M, "clean_distance_m": np.linalg.norm(clean_m, axis=1),
         "visibility": frames.visibility,
         **{name: np.array([len(row[name] or "") for row in captioned], float) for name in CAPTION_FIELDS},
-    }
+    }  # fmt: skip
     return TrackCount(
         name=frames.name, **{name: first[name] for name in ("track", "split", "walk", "pair")}, frames=len(rows),
         points=len(points), frames_digest=frames_digest(frames.index),

@@ -64,8 +64,7 @@ def _vectors(name: str, members: tuple[str, ...]) -> cached_property[np.ndarray]
 
 @dataclass(frozen=True)
 class TrackRows:
-    """The n rows of one track in the order of their frames, with the columns of a release; a column that a format lacks
-    is None everywhere."""
+    """The n rows of one track in the order of their frames; a column that a format lacks is None in all rows."""
 
     name: str  # run/town/trajectory/variant
     rows: Sequence[Row]

@@ -53,8 +53,7 @@ class AskingOutcome:
 
 
 class Asking:
-    """One run of a teacher over tracks. The captions of a finished track are its part file, those of an unfinished one
-    its gap file (tracks.py)."""
+    """One run of a teacher over tracks. Captions of a finished track are its part file, of others its gap file."""
 
     # Opened by `run`.
     teacher: Teacher

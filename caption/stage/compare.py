@@ -102,12 +102,9 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
         raise InputError(what, where=data, got=f"{num_windows} windows without conflict", fix=fix)
     comparisons = list(map(compare, STRATEGIES, zip(*trials, strict=True)))
     value = {
-        "schema": "cosfly.compare_strategies",
-        "schema_version": "2.0",
-        "teacher": cfg.teacher_kind,
-        "windows": num_windows,
-        "strategies": [asdict(comparison) for comparison in comparisons],
-    }
+        "schema": "cosfly.compare_strategies", "schema_version": "2.0", "teacher": cfg.teacher_kind,
+        "windows": num_windows, "strategies": [asdict(comparison) for comparison in comparisons],
+    }  # fmt: skip
     write_json(out / RESULT, value)
     return comparisons
 

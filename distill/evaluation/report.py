@@ -23,6 +23,7 @@ REPORT, REPORT_FORMAT = "report.json", FileFormat("cosfly.distill_report", "5.0"
 LANGUAGES: dict[Language, str] = {"en": "English", "zh": "Chinese"}
 # The paper's students: tab:distillation_summary, and the accuracies in the text of
 # sec:appendix_f_caption_distillation.
+PAPER_SAMPLES = 10_000
 PAPER: dict[str, dict[str, float]] = {
     "paper: Qwen3.5-2B + LoRA": {
         "parsed": 1.0, "accuracy": 0.6870, "accuracy_parsed": 0.6870, "bertscore_precision": 0.9282,
@@ -48,25 +49,22 @@ NOTES = [
 
 
 class Metric(Record):
-    """What a score was measured with; `stage.json` has the digests. cut: References longer than max_tokens."""
+    """What a score was measured with; `stage.json` has the digests."""
 
     model: str
     layer: int
     max_tokens: int
-    cut: int
+    cut: int  # references longer than max_tokens
     versions: dict[str, str]
 
 
 class StudentRecord(Record):
-    """The predictions of a student. not_asked: Samples of the split without one. without_decision: By reason.
-
-    samples_per_s: Of the last run of `distill infer`; None if unknown.
-    """
+    """The predictions of a student."""
 
     model: str
-    not_asked: int
-    without_decision: dict[str, int]
-    samples_per_s: float | None
+    not_asked: int  # samples of the split without a prediction
+    without_decision: dict[str, int]  # reason -> predictions
+    samples_per_s: float | None  # of the last run of `distill infer`; None if unknown
 
 
 class Example(Record):
@@ -80,30 +78,42 @@ class Example(Record):
 
 
 class Evaluation(Record):
-    """`report.json`. metrics: None if BERTScore was not computed."""
+    """`report.json`."""
 
     split: Split
     seed: int
     confidence: float = CONFIDENCE
     resamples: int = RESAMPLES
     students: dict[str, StudentRecord]
-    metrics: dict[Language, Metric | None]
+    metrics: dict[Language, Metric | None]  # None if BERTScore was not computed
     languages: dict[Language, Measurement]
     examples: list[Example]
 
 
 def _paper() -> dict[str, FigureSet]:
-    found = {}
-    for who, values in PAPER.items():
-        own = {name: Figure(value=values.get(name), low=None, high=None, count=10_000) for name in (*FIGURES, *TOKENS)}
-        figures, by_decision = ({name: own[name] for name in names} for names in (FIGURES, TOKENS))
-        found[who] = FigureSet(figures=figures, by_decision=by_decision, confusion={})
-    return found
+    """Return the figures of the paper's students, without intervals."""
+
+    def figure(values: dict[str, float], name: str) -> Figure:
+        return Figure(value=values.get(name), low=None, high=None, count=PAPER_SAMPLES)
+
+    return {
+        student: FigureSet(
+            figures={name: figure(values, name) for name in FIGURES},
+            by_decision={token: figure(values, token) for token in TOKENS},
+            confusion={},
+        )
+        for student, values in PAPER.items()
+    }
 
 
 def _shown(name: str, figure: Figure | None, *, signed: bool = False) -> str:
-    digits = ".4f" if name in (*BERTSCORE, "macro_f1") else ".1f" if name == "tokens" else ".1%"
-    return "-" if figure is None else figure.shown(f"{'+' if signed else ''}{digits}")
+    """Return the text of a figure of this name."""
+    if figure is None:
+        return "-"
+    digits = ".1f" if name == "tokens" else ".1%"
+    if name in (*BERTSCORE, "macro_f1"):
+        digits = ".4f"
+    return figure.shown(f"{'+' if signed else ''}{digits}")
 
 
 def tables_of(report: Evaluation, language: Language) -> list[TextTable]:

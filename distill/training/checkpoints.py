@@ -17,18 +17,14 @@ CHECKPOINT_FORMAT = FileFormat("cosfly.checkpoint", "3.0", "checkpoint")
 
 
 class Progress(BaseModel):
-    """How far a training is.
-
-    best_step: of the best validation, 0 before the first; stale: number of validations since then. samples: digest of
-    the samples that are used, on which the order of the steps depends.
-    """
+    """How far a training is."""
 
     step: int = 0
-    best_step: int = 0
+    best_step: int = 0  # of the best validation, 0 before the first
     best_loss: float | None = None
-    stale: int = 0
+    stale: int = 0  # number of validations since the best one
     has_ended: bool = False
-    samples: str = ""
+    samples: str = ""  # digest of the samples that are used, on which the order of the steps depends
 
 
 def learning_weights(student: Student) -> dict[str, Any]:

@@ -137,8 +137,7 @@ def survey_tracks(
 
 
 def open_track(candidate: Candidate) -> Track:
-    """Read a track under the name that it has in the release: trees of cosfly strictly, those of others as far as the
-    public layout demands."""
+    """Read a track under its name in the release; trees of cosfly must fit our own format, others the public one."""
     track = read_track(candidate.folder)
     if track.is_ours and track.issues:
         raise track.issues[0]
@@ -247,8 +246,7 @@ def place_tracks(tracks: list[Chosen], walks: dict[str, str], cfg: ReleaseConfig
 
 
 def shards_of(tracks: list[Chosen], target_bytes: int) -> list[PlannedShard]:
-    """Return the shards in the order of the release: split by split, and in each whole trajectories, both tracks of one
-    next to each other."""
+    """Return the shards split by split, each of whole trajectories with their tracks next to each other."""
     shards: list[PlannedShard] = []
     for split in SPLIT_NAMES:
         trajectories = defaultdict[str, list[Chosen]](list)

@@ -128,15 +128,9 @@ def open_writer(sink: str | IO[bytes], schema: pa.Schema) -> pq.ParquetWriter:
     small = [name for name in leaves if name != PICTURES["depth"].name and not name.endswith(".bytes")]
     repeated = [name for name in small if name in schema.names and schema.field(name).type == pa.string()]
     return pq.ParquetWriter(
-        sink,
-        schema,
-        compression=compression,
-        use_dictionary=repeated,
-        write_statistics=small,
-        version="2.6",
-        write_page_index=True,
-        write_batch_size=VALUES_PER_BATCH,
-    )
+        sink, schema, compression=compression, use_dictionary=repeated, write_statistics=small, version="2.6",
+        write_page_index=True, write_batch_size=VALUES_PER_BATCH,
+    )  # fmt: skip
 
 
 def _write_frames(chosen: Chosen, track: Track, files: Collection[FrameFile], frames: _RowGroups) -> None:
@@ -190,8 +184,7 @@ def _check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where
 
 
 def _digests(candidate: Candidate) -> dict[str, str]:
-    """Return the sha256 of each file of a track, if they are recorded; VerifyError if the track has changed since its
-    inspection."""
+    """Return the recorded sha256 of each file of a track; VerifyError if it has changed since its inspection."""
     folder = candidate.folder
     if candidate.sha256 is None:
         digests = read_checksums(folder) if (folder / CHECKSUMS).is_file() else {}

@@ -111,8 +111,7 @@ def _write_parts(
 
 
 def name_shards(parts: Sequence[tuple[Path, Shard]], folder: Path) -> list[Shard]:
-    """Link the files of shards under their names in the release, so that no byte moves and a kill costs nothing; return
-    the shards with these names."""
+    """Link the files of shards under their names in the release, so that no byte moves; return the named shards."""
     digest = digest_of([shard for _, shard in parts])
     for name in (FRAMES_FOLDER, POINTS_FOLDER):
         (folder / name).mkdir()

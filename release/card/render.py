@@ -59,13 +59,10 @@ def _front_matter(record: ReleaseRecord) -> str:
         for name, folder in (("default", FRAMES_FOLDER), ("points", POINTS_FOLDER))
     }
     matter = {
-        "license": for_terminal(record.licence),
-        "language": ["en", "zh"],
-        "pretty_name": for_terminal(record.name),
-        "task_categories": ["image-text-to-text", "robotics"],
-        "tags": tags,
+        "license": for_terminal(record.licence), "language": ["en", "zh"], "pretty_name": for_terminal(record.name),
+        "task_categories": ["image-text-to-text", "robotics"], "tags": tags,
         "configs": [{"config_name": name, "data_files": files} for name, files in configs.items()],
-    }
+    }  # fmt: skip
     return yaml.safe_dump(matter, sort_keys=False, allow_unicode=True).strip()
 
 

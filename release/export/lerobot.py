@@ -131,13 +131,10 @@ def values_of(rows: list[Row], episode: int, first: int, fps: int, tasks: Sequen
     values |= {name: [row[name] or "" for row in rows] for name in TEXTS}
     frames = np.arange(n, dtype=np.int64)
     return values | {
-        "next.done": frames == n - 1,
-        "frame_index": frames,
-        "timestamp": (frames / fps).astype(np.float32),
-        "episode_index": np.full(n, episode, dtype=np.int64),
-        "index": first + frames,
+        "next.done": frames == n - 1, "frame_index": frames, "timestamp": (frames / fps).astype(np.float32),
+        "episode_index": np.full(n, episode, dtype=np.int64), "index": first + frames,
         "task_index": np.array(tasks, dtype=np.int64),
-    }
+    }  # fmt: skip
 
 
 def task_of(goal: str, decision: str) -> str:
@@ -326,8 +323,7 @@ def _write_episode(
     task_numbers: dict[str, int], table: pq.ParquetWriter, videos: dict[str, Callable[[np.ndarray], None]],
     advance: Advance,
 ) -> dict[str, Any]:  # fmt: skip
-    """Write the rows and pictures of an episode, of this number and first frame; return its row of the table of
-    episodes."""
+    """Write the rows and pictures of an episode; return its row of the table of episodes."""
     if track.size_px != layout.size_px:
         problem, fix = "the lerobot export needs pictures of one size", "build one release for each size"
         got, expected = ("{} x {} px".format(*size) for size in (track.size_px, layout.size_px))

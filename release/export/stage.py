@@ -244,8 +244,7 @@ class _ShardNames:
 
 
 def shards(pieces: Iterable[SourceTrack], shard_mb: int) -> Iterator[tuple[str, Iterator[SourceTrack]]]:
-    """Group pieces of each split into files of about `shard_mb`; yield the name of each and its pieces, which are read
-    before the next file."""
+    """Group pieces of each split into files of about `shard_mb`; yield names and pieces, to be read in order."""
     return itertools.groupby(pieces, _ShardNames(shard_mb).next_name)
 
 
