@@ -306,11 +306,7 @@ def write_record(path: Path, record: ReleaseRecord) -> None:
 
 
 def read_record(path: Path) -> ReleaseRecord:
-    """Read `release.json`.
-
-    Raises:
-        InputError: there is none, or a field is wrong, which the error names.
-    """
+    """Read `release.json`; InputError if there is none, or names the field that is wrong."""
     if not path.exists():
         raise InputError(
             "the folder is not a release", where=path, expected="the folder of a release, or of a run with a release",

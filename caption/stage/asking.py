@@ -83,11 +83,7 @@ class Asking:
         self.dropped = Counter[str]()  # captions of this run by reason, before the first accepted one
 
     async def run(self, tracks: list[TrackInput]) -> AskingOutcome:
-        """Ask about every window that has no answer yet.
-
-        Raises:
-            TeacherError: No window would get an answer. Earlier answers are kept.
-        """
+        """Ask about every window that has no answer yet; TeacherError if no window would get one. Answers are kept."""
         path = self.stage.path
         guesses = [track.guess_num_windows(self.cfg.window) for track in tracks]
         try:

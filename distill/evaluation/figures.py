@@ -161,11 +161,8 @@ def ratios_of(samples: Sequence[Sample], answers: Answers) -> Ratios:
 
 
 def values_of(ratios: Ratios, walk: np.ndarray, draws: np.ndarray) -> dict[str, np.ndarray]:
-    """Return each figure on each draw, (draws,); NaN if nothing of the kind occurs.
-
-    Args:
-        walk: (n,) number of each sample's pedestrian trajectory. draws: (draws, walks) how often each is drawn.
-    """
+    """Return each figure on each draw, (draws,); NaN if nothing of the kind occurs. walk: (n,) number of each sample's
+    pedestrian trajectory. draws: (draws, walks), how often each of these is drawn."""
     num_walks = draws.shape[1]
     sums = np.array([[np.bincount(walk, part, num_walks) for part in pair] for pair in ratios.values()])
     numerators, denominators = (draws @ sums[:, k].T for k in range(2))

@@ -42,16 +42,13 @@ def run(
     predictions: Sequence[Path], dataset: Path, out: Path, *,
     encoders: Mapping[Language, Path] | None = None, judged: Sequence[Path] = (), seed: int = 0,
 ) -> Path:  # fmt: skip
-    """Read the predictions of students and their training set; write `report.json` and a page.
+    """Read the predictions of students and their training set; write `report.json`, whose path is returned, and a page.
 
     Args:
         predictions: `predictions.jsonl` of each student or its folder; the folder's name is the student's. Students are
             measured on the samples that all of them were asked.
         encoders: folders of the encoders of BERTScore; a language without one is not scored, and the report says so.
         judged: captions that `cosfly caption --teacher student:PATH` made of the answers.
-
-    Returns:
-        The path of `report.json`.
 
     Raises:
         InputError: an input is missing, or predictions and training set do not belong together.

@@ -90,11 +90,7 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
     """Read playback trees; write windows by split into `out`, which is returned.
 
     A perturbed track of N frames with a clean one gives (N - length) // stride + 1 windows. Tracks that cannot be read
-    are failures and do not stop the others.
-
-    Raises:
-        NothingKept: no track gives a window.
-        InputError: two trees are of one run.
+    are failures and do not stop the others. NothingKept: no track gives a window. InputError: two trees are of one run.
     """
     check_names([run_of(tree) for tree in trees])
     runs = {run_of(tree): tree for tree in trees}
@@ -128,9 +124,7 @@ def place_pairs(
     pairs: Mapping[Place, Pair], ids: Mapping[Place, str], cfg: DualTrackConfig, seed: int
 ) -> dict[Split, list[PlacedPair]]:
     """Assign the pairs of each pedestrian trajectory, or town, to a split."""
-    courses = [
-        Course(track_key(place), place.town, pair.clean.time_s, pair.clean.walked_m) for place, pair in pairs.items()
-    ]
+    courses = [Course(track_key(place), place.town, c.time_s, c.walked_m) for place, (_, c) in pairs.items()]
     walks = walks_of(courses)
     split_of = cfg.assigned(walks.keys(), walks, seed)
     by_split: dict[Split, list[PlacedPair]] = {split: [] for split in SPLITS}

@@ -234,14 +234,8 @@ class _Tracks:
 
 
 def run(cfg: PrepareConfig, sources: Sequence[RunSource], out: Path, *, seed: int = 0) -> Path:
-    """Read the captions and playback trees of some runs; write a training set (distill/schema.py) into `out`.
-
-    Returns:
-        `out`.
-
-    Raises:
-        NothingKept: no caption can be used. VerifyError: captions are of another tree.
-    """
+    """Read the captions and playback trees of some runs; write a training set (distill/schema.py) into `out`, which is
+    returned. NothingKept: no caption can be used. VerifyError: captions are of another tree."""
     inputs = tree_inputs([source.data for source in sources], [source.captions for source in sources])
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed)
     if stage.is_complete:
@@ -276,9 +270,7 @@ def run(cfg: PrepareConfig, sources: Sequence[RunSource], out: Path, *, seed: in
     page = write_page(out, "Training set", counts, trees, PAGE_TEXT.format(cfg.split_by))
     num_kept = sum(counts.values())
     tally = Tally(input=num_kept + dropped.total(), kept=num_kept, dropped=dropped)
-    facts = {split: _facts(in_split, samples["train"]) for split, in_split in samples.items()}
-    _warn(facts)
-    stage.finish([*paths, out / RECORD, page], tally, splits=facts, split_by=cfg.split_by)
+    stage.finish([*paths, out / RECORD, page], tally, splits=_facts(samples), split_by=cfg.split_by)
     return out
 
 
@@ -301,23 +293,18 @@ def _read_windows(tracks: _Tracks) -> tuple[dict[str, list[Sample]], Counter[str
     return windows, dropped
 
 
-def _facts(samples: Sequence[Sample], train: Sequence[Sample]) -> dict[str, Any]:
-    """Return the counts of a split in the manifest."""
-    decisions = dict(sorted(Counter(sample.decision for sample in samples).items()))
-    in_train = {sample.decision for sample in train}
-    return {
-        "samples": len(samples),
-        "walks": len({sample.walk for sample in samples}),
-        "tracks": len({(sample.run, sample.town, sample.trajectory, sample.variant) for sample in samples}),
-        "by_decision": decisions,
-        "not_in_train": {name: count for name, count in decisions.items() if name not in in_train},
-    }
-
-
-def _warn(facts: Mapping[Split, Mapping[str, Any]]) -> None:
-    """Warn of empty splits, and of decisions that training does not have."""
-    for split, counts in facts.items():
-        if not counts["samples"]:
+def _facts(samples: Mapping[Split, Sequence[Sample]]) -> dict[str, dict[str, Any]]:
+    """Return the counts of the manifest; warn of empty splits and of decisions that training does not have."""
+    facts: dict[str, dict[str, Any]] = {}
+    in_train = {sample.decision for sample in samples["train"]}
+    for split, in_split in samples.items():
+        decisions = dict(sorted(Counter(sample.decision for sample in in_split).items()))
+        if not in_split:
             log.warning("%s: the split %s is empty", STAGE, split)
-        if counts["not_in_train"]:
-            log.warning("%s: %s has decisions that train does not have: %s", STAGE, split, counts["not_in_train"])
+        if not_in_train := {name: count for name, count in decisions.items() if name not in in_train}:
+            log.warning("%s: %s has decisions that train does not have: %s", STAGE, split, not_in_train)
+        walks = {sample.walk for sample in in_split}
+        tracks = {(sample.run, sample.town, sample.trajectory, sample.variant) for sample in in_split}
+        counts = {"samples": len(in_split), "walks": len(walks), "tracks": len(tracks)}
+        facts[split] = {**counts, "by_decision": decisions, "not_in_train": not_in_train}
+    return facts

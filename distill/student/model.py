@@ -80,12 +80,8 @@ def is_hub_name(name: str) -> bool:
 
 
 def student_path(name: str, *, allow_code: bool = False) -> Path:
-    """Return the folder or the GGUF file of a student.
-
-    Args:
-        name: a folder, a GGUF file, or a repository, such as `Qwen/Qwen3.5-2B`, to download into the hub's cache.
-        allow_code: download the code of the repository too.
-    """
+    """Return the folder or the GGUF file of a student. A repository, such as `Qwen/Qwen3.5-2B`, is downloaded into the
+    hub's cache, with its code if `allow_code`."""
     if not is_hub_name(name):
         return Path(name)
     require("torch", "transformers", "peft")
@@ -216,10 +212,8 @@ def load_student(
     with loading_errors("configuration of the student", path):
         config = AutoConfig.from_pretrained(**arguments)
     stored = None if path.suffix == GGUF else getattr(config, "dtype", None)
-    own_classes = getattr(config, "auto_map", None) or {}
-    takes_pictures = (
-        type(config) in MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING or "AutoModelForImageTextToText" in own_classes
-    )
+    own_code = getattr(config, "auto_map", None) or {}
+    takes_pictures = type(config) in MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING or "AutoModelForImageTextToText" in own_code
     with loading_errors("tokenizer of the student", path):
         tokenizer: Any = AutoTokenizer.from_pretrained(**arguments)
     library = None

@@ -57,13 +57,13 @@ def write_student(student: Student, folder: Path, base: Path, base_name: str = "
     adapters = getattr(student.model, "peft_config", {})
     for config in adapters.values():
         config.base_model_name_or_path = base_name
-    files = {path for pattern in COPIED for path in base.glob(pattern)} if base.is_dir() and not adapters else set()
-    for path in sorted(files):
-        if path.is_file() and "safetensors" not in path.name:
-            shutil.copyfile(path, folder / path.name)  # the content, because a hub's cache has links
-    more = {"save_embedding_layers": False} if adapters else {}  # peft would look for the base on the hub
+    if base.is_dir() and not adapters:
+        for path in sorted({path for pattern in COPIED for path in base.glob(pattern)}):
+            if path.is_file() and "safetensors" not in path.name:
+                shutil.copyfile(path, folder / path.name)  # the content, because a hub's cache has links
+    options = {"save_embedding_layers": False} if adapters else {}  # peft would look for the base on the hub
     with writing_errors(folder):
-        student.model.save_pretrained(folder, **more)
+        student.model.save_pretrained(folder, **options)
         if not base.is_dir() and not adapters:
             student.tokenizer.save_pretrained(folder)
     if student.template:

@@ -179,7 +179,7 @@ def run(
         student: a folder, a GGUF file, the name of a repository, or `tiny` or `random`, which are made in `out`.
 
     Returns:
-        The folder of the adapter, which peft loads, or of the model, which transformers loads.
+        The folder `adapter/`, which peft loads, or `model/`, which transformers loads.
 
     Raises:
         InputError: an input is missing or does not fit. ResumeError: another process is at work in `out`.

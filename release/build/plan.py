@@ -80,11 +80,8 @@ class ReleasePlan:
 
 
 def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> ReleasePlan:
-    """Read all of the material but the pictures, and decide what is released where.
-
-    Raises:
-        InputError, VerifyError: The material cannot be released.
-    """
+    """Read all of the material but the pictures, and decide what is released where; InputError or VerifyError if it
+    cannot be released."""
     material = gather(sources, include_review=cfg.include_review, choice=TrackChoice(match=cfg.flights))
     tracks, walks, dropped = survey_tracks(material.candidates, sources, cfg.tracks)
     tracks, without_twin = keep_pairs(tracks, cfg)
@@ -105,14 +102,8 @@ def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> 
 def survey_tracks(
     candidates: list[Candidate], sources: list[Source], tracks: tuple[TrackName, ...]
 ) -> tuple[list[Chosen], dict[str, str], Counter[str]]:
-    """Read the tracks that no inspection drops.
-
-    Args:
-        tracks: The kinds of track to release.
-
-    Returns:
-        The tracks of these kinds; trajectory -> walk; why others are dropped.
-    """
+    """Read the tracks that no inspection drops; return those of the kinds `tracks`, trajectory -> walk, and the counts
+    of the others by reason."""
     chosen: list[Chosen] = []
     dropped = Counter(candidate.dropped for candidate in candidates if candidate.dropped is not None)
     remaining = [candidate for candidate in candidates if candidate.dropped is None]

@@ -52,11 +52,8 @@ class ShardResult(BaseModel):
 def write_shard(
     path: Path, tracks: Sequence[Chosen], files: Collection[FrameFile], row_group_bytes: int
 ) -> ShardResult:
-    """Write the selected frames of some tracks, and all of their points, a row group each.
-
-    Raises:
-        InputError, VerifyError: Names the first file that cannot be released.
-    """
+    """Write the selected frames of some tracks, and all of their points, a row group each; InputError or VerifyError
+    names the first file that cannot be released."""
     points_path, schema = points_part(path), columns.points_schema()
     with (
         atomic_file(points_path) as points_file,

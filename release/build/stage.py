@@ -94,9 +94,7 @@ def _write_parts(
     cfg: ReleaseConfig, plan: ReleasePlan, stage: StageFolder, parts: Path, workers: int, watch: Watch
 ) -> list[tuple[Path, Shard]]:
     """Write all shards that are not written yet; return all, with their files until the release has its name."""
-    items = [
-        Item(shard.name, shard.tracks, sum(len(track.selected) for track in shard.tracks)) for shard in plan.shards
-    ]
+    items = [Item(part.name, part.tracks, sum(len(track.selected) for track in part.tracks)) for part in plan.shards]
     arguments = (cfg.modalities, cfg.row_group_bytes, parts)
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="release: frames")
     if failed := [record for record in finished.records if isinstance(record, Failed)]:

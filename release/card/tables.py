@@ -272,11 +272,7 @@ STYLE = """
 
 
 def run(dataset: Path, out: Path) -> Path:
-    """Read the record of a release; write `stats.json` and `stats.html`, and return the page.
-
-    Raises:
-        InputError: If the folder is not a release.
-    """
+    """Read the record of a release (InputError if there is none); write `stats.json` and `stats.html`; return this."""
     record = read_record(release_folder(dataset) / RECORD)
     tables, runs = tables_of(record), [source.run for source in record.provenance.sources]
     write_json(out / "stats.json", {

@@ -191,15 +191,8 @@ def key_of(sample_id: str) -> str:
 
 
 def open_release(folder: Path, consecutive: str = "") -> ExportSource:
-    """Open a release, or that of a run.
-
-    Args:
-        consecutive: What needs consecutive frames, if something does.
-
-    Raises:
-        InputError: If the folder has no release, if the release is incomplete or lacks consecutive frames that are
-            needed.
-    """
+    """Open a release, or that of a run; InputError if there is none, or if it is incomplete, or if it lacks consecutive
+    frames, which something needs that is named `consecutive` in the message."""
     folder = release_folder(folder)
     record = read_record(folder / RECORD)
     if consecutive:
