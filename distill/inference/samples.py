@@ -70,7 +70,7 @@ class Inputs:
 
     @property
     def name(self) -> str:
-        """Name of a model in this process: of `run/student/model` "student", with `run/lora/adapter` "student+lora"."""
+        """Name by the folders: `x/student/model` is "student", with the adapter `x/lora/adapter` "student+lora"."""
         folder = Path(self.model).absolute()
         name = folder.parent.name if folder.name == "model" else folder.name
         return name if self.adapter is None else f"{name}+{self.adapter.absolute().parent.name}"

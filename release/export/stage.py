@@ -191,8 +191,8 @@ def key_of(sample_id: str) -> str:
 
 
 def open_release(folder: Path, consecutive: str = "") -> ExportSource:
-    """Open a release, or that of a run; InputError if there is none, or if it is incomplete, or if it lacks consecutive
-    frames, which something needs that is named `consecutive` in the message."""
+    """Open a release, or that of a run; InputError if there is none or it is incomplete. `consecutive` names, for the
+    message, what needs consecutive frames; then InputError if the release has skipped some."""
     folder = release_folder(folder)
     record = read_record(folder / RECORD)
     if consecutive:

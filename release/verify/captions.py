@@ -41,13 +41,7 @@ def _wrong_columns(row: Row) -> list[str]:
 def released_track(
     frames: TrackRows, points: TrackRows, clean: TrackRows | None, settings: dict[str, Any]
 ) -> ReleasedTrack:
-    """Return what a reader of captions needs of a track.
-
-    Args:
-        points: All points of the track.
-        clean: All points of its clean track, if it is perturbed and that is released; not used if it has other frames.
-        settings: Of the captions, as the record has them.
-    """
+    """Return what a reader of captions needs: all points of a track, and of its clean one if it has the same frames."""
     captions = [shown_caption(row) for row in frames.rows if row.get("has_caption")]
     twin = None
     if clean is not None and len(clean) == len(points):
