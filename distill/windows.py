@@ -32,7 +32,8 @@ FLAGS = ("target_in_view", "target_visible")
 PLACE = ("run", "town", "trajectory", "variant")
 # Types of the columns; all others are texts.
 TYPES: dict[str, pa.DataType] = {
-    **{name: pa.struct([(m, pa.float64()) for m in own]) if own else pa.float64() for name, own in FACTS.items()},
+    **{name: pa.struct(dict.fromkeys(members, pa.float64())) for name, members in FACTS.items() if members},
+    **{name: pa.float64() for name, members in FACTS.items() if not members},
     **dict.fromkeys(FLAGS, pa.bool_()),
     **dict.fromkeys(("caption_window", "caption_picture_px"), pa.list_(pa.int32())),
     "image": pa.struct([("bytes", pa.binary()), ("path", pa.string())]),

@@ -66,8 +66,7 @@ class ReleasedFlight(Strict):
     @property
     def town(self) -> str:
         """The town of the track, "" if the record has a flight without one."""
-        _, _, in_run = self.flight.partition("/")
-        return in_run.partition("/")[0]
+        return f"{self.flight}//".split("/")[1]
 
     @property
     def trajectory(self) -> str:

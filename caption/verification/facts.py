@@ -266,7 +266,8 @@ def _measure_frame(frame: ObservedFrame, camera_px: tuple[int, int], picture_px:
     distance = math.hypot(away_x, away_y)
     x_scale, y_scale = picture_px[0] / camera_px[0], picture_px[1] / camera_px[1]
     left, top, right, bottom = frame.target_bbox
-    left, top, right, bottom = left * x_scale, top * y_scale, right * x_scale, bottom * y_scale
+    left, right = left * x_scale, right * x_scale
+    top, bottom = top * y_scale, bottom * y_scale
     # The centre of the box is where the person is seen; uv (the hip) replaces it where a tree has no box.
     centre_x, centre_y = (left + right) / 2.0, (top + bottom) / 2.0
     if math.isnan(left):

@@ -183,7 +183,7 @@ def measure(
     names, walk = np.unique([sample.walk for sample in samples], return_inverse=True)
     draws = np.vstack([np.ones(len(names)), draw_pedestrians(len(names), RESAMPLES, rng)])  # the first: all samples
     ratios = {name: ratios_of(samples, answers) for name, answers in everyone.items()}
-    values = {name: values_of(own, walk, draws) for name, own in ratios.items()}
+    values = {name: values_of(ratios_of_one, walk, draws) for name, ratios_of_one in ratios.items()}
 
     def figure(on_draws: np.ndarray, count: float) -> Figure:
         return figure_of_draws(float(on_draws[0]), on_draws[1:], int(count), len(names), CONFIDENCE)

@@ -125,22 +125,22 @@ def tables_of(report: Evaluation, language: Language) -> list[TextTable]:
     labels = {name: name if name in report.students or name == TEACHER else f"baseline: {name}" for name in part.who}
     columns = {label: part.who[name] for name, label in labels.items()} | _paper()
     encoder = f" ({metric.model} layer {metric.layer})" if metric else ""
-    main = [
-        [words + encoder * (name in BERTSCORE), *(_shown(name, own.figures[name]) for own in columns.values())]
-        for name, words in FIGURES.items()
-        if any(own.figures[name].value is not None for own in part.who.values())
-    ]
+    main = []
+    for name, words in FIGURES.items():
+        if any(figure_set.figures[name].value is not None for figure_set in part.who.values()):
+            title = words + encoder if name in BERTSCORE else words
+            main.append([title, *(_shown(name, figure_set.figures[name]) for figure_set in columns.values())])
     counts = {token: figure.count for token, figure in part.who[TEACHER].by_decision.items()}
-    decisions = [
-        [f"{token} ({counts[token]})", *(_shown(token, own.by_decision.get(token)) for own in columns.values())]
-        for token in sorted(counts, key=lambda token: -counts[token])
-    ]
+    decisions = []
+    for token in sorted(counts, key=lambda token: -counts[token]):
+        cells = [_shown(token, figure_set.by_decision.get(token)) for figure_set in columns.values()]
+        decisions.append([f"{token} ({counts[token]})", *cells])
     heading = f"{LANGUAGES[language]}: {part.samples} samples of {part.walks} pedestrian trajectories"
     tables = [TextTable(heading, ["", *columns], main)]
     tables.append(TextTable("Accuracy by the teacher's decision", ["", *columns], decisions))
     for pairing in part.pairings:
-        found = {name: figure for name, figure in pairing.differences.items() if figure.value is not None}
-        rows = [[FIGURES[name], _shown(name, figure, signed=True)] for name, figure in found.items()]
+        known = {name: figure for name, figure in pairing.differences.items() if figure.value is not None}
+        rows = [[FIGURES[name], _shown(name, figure, signed=True)] for name, figure in known.items()]
         tables.append(TextTable(f"{pairing.first} minus {pairing.second}", ["", "difference"], rows))
     return tables
 
@@ -165,8 +165,8 @@ def notes_of(report: Evaluation) -> list[str]:
         if student.not_asked:
             facts.append(f"{student.not_asked} samples of the split have no prediction")
         notes.append("; ".join([f"{name} is {student.model}", *facts]) + ".")
-    everyone = [own for part in report.languages.values() for own in part.who.values()]
-    if all(own.figures["values_matched"].value is None for own in everyone):
+    everyone = [figure_set for part in report.languages.values() for figure_set in part.who.values()]
+    if all(figure_set.figures["values_matched"].value is None for figure_set in everyone):
         notes.append("Values were not checked; pass the captions of cosfly caption --teacher student:PATH as --judged.")
     return notes
 

@@ -171,11 +171,11 @@ def _check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where
         if not 0.0 <= low <= high <= SKY_DEPTH_M:
             what, expected = "the depth image has values that are not depths", f"0 to {SKY_DEPTH_M:g} m"
             raise InputError(what, where=where, got=f"{low:g} to {high:g} m", expected=expected, fix=RENDER)
-        found: tuple[int, ...] | None = depth.shape[::-1]
+        picture_px: tuple[int, ...] | None = depth.shape[::-1]
     else:
-        found = png_size(data) if is_inspected else colours_of(data, where).shape[1::-1]
-    if found != size_px:
-        got = "no PNG" if found is None else "{} x {} px".format(*found)
+        picture_px = png_size(data) if is_inspected else colours_of(data, where).shape[1::-1]
+    if picture_px != size_px:
+        got = "no PNG" if picture_px is None else "{} x {} px".format(*picture_px)
         expected = "{} x {} px".format(*size_px)
         raise InputError("the picture has the wrong size", where=where, got=got, expected=expected, fix=RENDER)
 

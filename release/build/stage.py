@@ -150,8 +150,8 @@ def provenance_of(sources: list[Source], inputs: Mapping[str, StageInput], accou
 def _source(source: Source, names: dict[str, str], inputs: Mapping[str, StageInput]) -> SourceRecord:
     sha256 = {f"{role}_sha256": inputs[names[role]].sha256 for role in SOURCE_FILES if role in names}
     stages = [
-        SourceStage(stage=one.stage, code_version=one.code_version, seed=one.seed, config=published(one.config))
-        for one in stages_behind(source.files.values())
+        SourceStage(stage=made.stage, code_version=made.code_version, seed=made.seed, config=published(made.config))
+        for made in stages_behind(source.files.values())
     ]
     return SourceRecord(run=source.run, stages=stages, **sha256)
 

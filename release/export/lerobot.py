@@ -180,8 +180,7 @@ def merged(summaries: Sequence[Summary]) -> Summary:
 
 
 def _merge_all(stats: Sequence[dict[str, Summary]]) -> dict[str, Summary]:
-    """Merge the summaries of each feature."""
-    return {name: merged([summaries[name] for summaries in stats]) for name in stats[0]}
+    return {name: merged([by_feature[name] for by_feature in stats]) for name in stats[0]}
 
 
 # --- the export -------------------------------------------------------------------------------------------------------
