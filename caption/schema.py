@@ -34,8 +34,7 @@ TextState = Literal["relative", "paper"]
 
 @dataclass(frozen=True, eq=False)
 class ObservedFrame:
-    """The flight data of one frame, in plain numbers, NaN if unknown. Windows share it, so that values are computed
-    once."""
+    """The flight data of one frame, in plain numbers, NaN if unknown. Windows share it, so it is computed once."""
 
     time_s: float
     position_m: Sequence[float]  # x, y, z of the drone

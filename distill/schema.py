@@ -75,8 +75,8 @@ class Sample(SplitMember):
 
     def without_pictures(self) -> Sample:
         """Return the sample for a student that takes no pictures; its prompt says that none are given."""
-        told, none = (pictures.sentence(self.language) for pictures in (self.pictures, Pictures((), self.picture_px)))
-        user = self.prompt.user.replace(told, none)
+        no_pictures = Pictures((), self.picture_px)
+        user = self.prompt.user.replace(self.pictures.sentence(self.language), no_pictures.sentence(self.language))
         return self.model_copy(update={"views": (), "prompt": self.prompt.model_copy(update={"user": user})})
 
     @property
@@ -98,11 +98,11 @@ class SourceTree(Record):
 
 
 class TrainingSet(Record):
-    """`training_set.json`. trees: Empty without pictures. samples: Number in each split."""
+    """`training_set.json`."""
 
     split_by: Literal["walk", "town"]
-    trees: list[SourceTree]
-    samples: dict[Split, int]
+    trees: list[SourceTree]  # empty without pictures
+    samples: dict[Split, int]  # number of them
 
 
 def read_training_set(dataset: Path) -> TrainingSet:
@@ -112,42 +112,50 @@ def read_training_set(dataset: Path) -> TrainingSet:
 
 def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
     """Return which of the given playback trees belongs to which run of a training set: run -> tree."""
-    wanted = {tree.run: tree.sha256 for tree in read_training_set(dataset).trees}  # two runs may have equal trees
-    found = {fingerprint(path): path for path in data if wanted}  # none for a set without pictures
-    for digest, path in found.items():
-        if digest not in wanted.values():
+    digests = {tree.run: tree.sha256 for tree in read_training_set(dataset).trees}  # two runs may have equal trees
+    if not digests:  # a set without pictures
+        return {}
+    paths = {fingerprint(path): path for path in data}
+    for digest, path in paths.items():
+        if digest not in digests.values():
             what = "the training set was not made from this directory of rendered tracks"
-            expected = ", ".join(f"{run}: {sha256}" for run, sha256 in wanted.items())
+            expected = ", ".join(f"{run}: {sha256}" for run, sha256 in digests.items())
             fix = "pass the unchanged trees of the training set, or prepare a training set from this tree"
             raise InputError(what, where=path, got=f"the digest {digest}", expected=expected, fix=fix)
-    if missing := [run for run, digest in wanted.items() if digest not in found]:
+    if missing := [run for run, digest in digests.items() if digest not in paths]:
         problem, again = "--data lacks playback trees of the training set", "pass --data for these trees, too"
         raise InputError(problem, where=dataset, expected=f"also the trees of {', '.join(missing)}", fix=again)
-    return {run: found[digest] for run, digest in wanted.items()}
+    return {run: paths[digest] for run, digest in digests.items()}
 
 
 def tree_inputs(trees: Collection[Path], captions: Collection[Path] = ()) -> dict[str, Path]:
-    """Name playback trees and their captions as inputs of a stage: `data`, `captions`; of several with a number."""
-    numbers = [f"{number}." for number in range(1, len(trees) + 1)] if len(trees) > 1 else [""]
-    named = {"data": trees, "captions": captions}.items()
-    return {number + name: path for name, paths in named for number, path in zip(numbers, paths, strict=False)}
+    """Return playback trees and their captions as named inputs of a stage: `data`, `captions`; of several `1.data`."""
+    inputs: dict[str, Path] = {}
+    for name, paths in (("data", trees), ("captions", captions)):
+        for number, path in enumerate(paths, 1):
+            inputs[f"{number}.{name}" if len(trees) > 1 else name] = path
+    return inputs
 
 
-def arrow_type(of: Any) -> pa.DataType:
+def arrow_type(annotation: Any) -> pa.DataType:
     """Return the type of a column for a field: text, number, flag, record, a tuple of one of these, or optional."""
-    if (parts := get_args(of)) and get_origin(of) is not Literal:
-        if get_origin(of) is tuple:
-            return pa.list_(pa.field("element", arrow_type(parts[0])))
-        return arrow_type(parts[0])  # or None
-    if isinstance(of, type) and issubclass(of, BaseModel):
-        return pa.struct(columns_of(of))
-    return {int: pa.int32(), float: pa.float64(), bool: pa.bool_()}.get(of, pa.string())
+    parts, origin = get_args(annotation), get_origin(annotation)
+    if origin is tuple:
+        return pa.list_(pa.field("element", arrow_type(parts[0])))
+    if parts and origin is not Literal:
+        return arrow_type(parts[0])  # a type or None
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return pa.struct(columns_of(annotation))
+    return {int: pa.int32(), float: pa.float64(), bool: pa.bool_()}.get(annotation, pa.string())
 
 
 def columns_of(model: type[BaseModel]) -> pa.Schema:
     """Return the columns of a file of records."""
-    types = {name: field.annotation for name, field in model.model_fields.items()}
-    return pa.schema([pa.field(name, arrow_type(of), type(None) in get_args(of)) for name, of in types.items()])
+    fields = []
+    for name, field in model.model_fields.items():
+        is_optional = type(None) in get_args(field.annotation)
+        fields.append(pa.field(name, arrow_type(field.annotation), is_optional))
+    return pa.schema(fields)
 
 
 def split_path(dataset: Path, split: str) -> Path:
@@ -157,8 +165,9 @@ def split_path(dataset: Path, split: str) -> Path:
 
 def open_split(dataset: Path, split: Split, *, text_only: bool = False) -> list[Sample]:
     """Read the samples of a split; `text_only` for a student that takes no pictures: they come without them."""
-    path, has_file = split_path(dataset, split), read_training_set(dataset).samples.get(split)
-    rows = rows_of(path, columns_of(Sample).names) if has_file else ()
+    path = split_path(dataset, split)
+    is_empty = not read_training_set(dataset).samples.get(split)
+    rows = () if is_empty else rows_of(path, columns_of(Sample).names)
     samples = (validated(Sample, row, f"{path}: row {number}") for number, row in enumerate(rows))
     return [sample.without_pictures() if text_only else sample for sample in samples]
 
@@ -166,14 +175,12 @@ def open_split(dataset: Path, split: Split, *, text_only: bool = False) -> list[
 def write_splits(
     out: Path, model: type[SplitMember], records: Mapping[Split, Iterable[SplitMember]]
 ) -> tuple[dict[Split, int], list[Path]]:
-    """Write records to one parquet file per split, which appears when it is complete.
-
-    Returns:
-        The number of records of each split, and the files.
-    """
-    columns, counts = columns_of(model), dict[Split, int]()
-    for split, own in records.items():
-        counts[split], rows = 0, (record.model_dump(mode="json") for record in own)
+    """Write a parquet file per split, which appears when it is complete; return counts of records, and the files."""
+    columns = columns_of(model)
+    counts: dict[Split, int] = {}
+    for split, in_split in records.items():
+        counts[split] = 0
+        rows = (record.model_dump(mode="json") for record in in_split)
         with contextlib.ExitStack() as stack:
             writer: pq.ParquetWriter | None = None
             while part := list(islice(rows, ROWS_AT_ONCE)):

@@ -32,7 +32,8 @@ FLAGS = ("target_in_view", "target_visible")
 PLACE = ("run", "town", "trajectory", "variant")
 # Types of the columns; all others are texts.
 TYPES: dict[str, pa.DataType] = {
-    **{name: pa.struct([(m, pa.float64()) for m in own]) if own else pa.float64() for name, own in FACTS.items()},
+    **{name: pa.struct(dict.fromkeys(members, pa.float64())) for name, members in FACTS.items() if members},
+    **{name: pa.float64() for name, members in FACTS.items() if not members},
     **dict.fromkeys(FLAGS, pa.bool_()),
     **dict.fromkeys(("caption_window", "caption_picture_px"), pa.list_(pa.int32())),
     "image": pa.struct([("bytes", pa.binary()), ("path", pa.string())]),
@@ -41,31 +42,26 @@ TYPES: dict[str, pa.DataType] = {
 
 
 class WindowData(TypedDict):
-    """One window of k frames.
-
-    flight: run/town/trajectory/variant. window: (k,) int64, frames of the track, the caption's own last. frames: (k, 3,
-    h, w) uint8 RGB, in the size to which pixels in prompt and caption refer. facts: FACTS, (k, members) or (k,)
-    float64, NaN if unknown; FLAGS (k,) bool; pixels refer to the unscaled frame. prompt: system and user. caption: the
-    three texts, `label` and `verdict`; "" if there is none.
-    """
+    """One window of k frames."""
 
     sample_id: str
-    flight: str
-    window: np.ndarray
-    frames: np.ndarray
+    flight: str  # the track: run/town/trajectory/variant
+    window: np.ndarray  # (k,) int64, frames of the track, the caption's own last
+    frames: np.ndarray  # (k, 3, h, w) uint8 RGB, in the size to which pixels in prompt and caption refer
+    # FACTS, (k, members) or (k,) float64, NaN if unknown; FLAGS, (k,) bool. Pixels refer to the unscaled frame.
     facts: dict[str, np.ndarray]
-    prompt: dict[str, str]
-    caption: dict[str, str]
+    prompt: dict[str, str]  # system and user
+    caption: dict[str, str]  # the three texts, `label` and `verdict`; "" if there is none
 
 
 class WindowPlace(NamedTuple):
-    """A window before it is read: its track, its frames, and the numbers of their rows in a shard."""
+    """A window before it is read."""
 
     sample_id: str
-    flight: tuple[str, ...]
-    window: tuple[int, ...]
-    shard: int
-    rows: tuple[int, ...]
+    flight: tuple[str, ...]  # as PLACE
+    window: tuple[int, ...]  # frames of the track
+    shard: int  # number of the shard
+    rows: tuple[int, ...]  # numbers of the rows of these frames in the shard
 
 
 class _Shard(BaseModel):
@@ -90,12 +86,12 @@ class WindowDataset(Sequence[WindowData]):
 
     def __init__(self, source: str | Path, *, language: Language = "en", split: str | None = None) -> None:
         self.language = language
-        folders = [Path(source, name) for name in ("", "dataset", "release/dataset")]
-        found = [folder for folder in folders if (folder / "release.json").is_file()]
-        if not found:
+        candidates = [Path(source, name) for name in ("", "dataset", "release/dataset")]
+        releases = [folder for folder in candidates if (folder / "release.json").is_file()]
+        if not releases:
             fix = "pass a release, or build one with cosfly release build"
             raise InputError("the source contains no release", where=source, expected="release.json", fix=fix)
-        self.folder = found[0]
+        self.folder = releases[0]
         path = self.folder / "release.json"
         record = validated(_Record, read_object(path, what="release", tree=self.folder), path)
         splits = sorted({shard.split for shard in record.shards})
@@ -117,25 +113,26 @@ class WindowDataset(Sequence[WindowData]):
     def _places_in(self, shard: int, path: Path) -> Iterator[WindowPlace]:
         """Yield the windows of a shard, which contains whole tracks."""
         text = f"caption_{self.language}_reasoning_trace"
-        light = [*PLACE, "frame_index", "sample_id", "caption_window", text]
+        names = [*PLACE, "frame_index", "sample_id", "caption_window", text]
         with open_table(path, tree=self.folder) as table:
             types = {field.name: field.type for field in table.schema_arrow}
-        if wrong := [name for name in (*self._columns, *light) if types.get(name) != TYPES.get(name, pa.string())]:
+        if wrong := [name for name in (*self._columns, *names) if types.get(name) != TYPES.get(name, pa.string())]:
             fix = "build the release with this version of cosfly, or download it with --modality rgb"
             got = ", ".join(wrong)[:200]
             raise InputError("columns are missing or of the wrong type", where=path, got=got, fix=fix)
-        rows: dict[tuple[str, ...], dict[int, int]] = {}
-        captioned: list[tuple[tuple[str, ...], str, tuple[int, ...]]] = []
-        for number, row in enumerate(rows_of(path, light, tree=self.folder)):
+        row_numbers: dict[tuple[str, ...], dict[int, int]] = {}  # track -> frame -> number of its row
+        captioned: list[WindowPlace] = []  # without the numbers of their rows
+        for number, row in enumerate(rows_of(path, names, tree=self.folder)):
             flight = tuple(row[part] for part in PLACE)
             if None in (*flight, row["sample_id"], row["frame_index"]):
                 raise InputError("a part of the id is null", where=f"{path}: row {number}", got=shown(list(flight)))
-            rows.setdefault(flight, {})[row["frame_index"]] = number
+            row_numbers.setdefault(flight, {})[row["frame_index"]] = number
             if row[text] and row["caption_window"]:
-                captioned.append((flight, row["sample_id"], tuple(row["caption_window"])))
-        for flight, sample_id, window in captioned:
-            if rows[flight].keys() >= set(window):
-                yield WindowPlace(sample_id, flight, window, shard, tuple(rows[flight][index] for index in window))
+                captioned.append(WindowPlace(row["sample_id"], flight, tuple(row["caption_window"]), shard, ()))
+        for place in captioned:
+            of_track = row_numbers[place.flight]
+            if of_track.keys() >= set(place.window):
+                yield place._replace(rows=tuple(of_track[index] for index in place.window))
 
     def __len__(self) -> int:
         return len(self._places)
@@ -147,11 +144,10 @@ class WindowDataset(Sequence[WindowData]):
         system, user = last[f"system_{language}"], last[f"prompt_{language}"]
         if not isinstance(system, str) or not isinstance(user, str):
             raise InputError("the caption has no prompt", where=place.sample_id, fix="caption the run again")
-        pictures = [row["image"] and row["image"]["bytes"] for row in rows]
-        if not all(pictures):
+        if not all(row["image"] and row["image"]["bytes"] for row in rows):
             fix = "download the release with --modality rgb"
             raise InputError("a frame has no picture", where=place.sample_id, fix=fix)
-        frames = [colours_of(picture, place.sample_id) for picture in pictures]
+        frames = [colours_of(row["image"]["bytes"], place.sample_id) for row in rows]
         if len({frame.shape for frame in frames}) != 1:
             raise InputError("the frames of a window differ in size", where=place.sample_id)
         height_px, width_px = frames[0].shape[:2]
@@ -173,5 +169,6 @@ class WindowDataset(Sequence[WindowData]):
 def _column(rows: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
     """Return a fact of some frames, (k, members) or (k,); None becomes NaN or False."""
     members = FACTS[name]
-    values = [[(row[name] or {}).get(member) for member in members] if members else row[name] for row in rows]
-    return np.array(values, dtype=bool if name in FLAGS else np.float64)
+    if members:
+        return np.array([[(row[name] or {}).get(member) for member in members] for row in rows], dtype=np.float64)
+    return np.array([row[name] for row in rows], dtype=bool if name in FLAGS else np.float64)

@@ -132,13 +132,11 @@ def count_track(frames: TrackRows, points: TrackRows) -> TrackCount:
     is_zooming = bool((np.abs(fovs - fovs[0]) > SAME_FOV_DEG).any())
     captioned = [row for row in rows if row["has_caption"]]
     measured = {
-        "height_m": to_drone_m[:, 2],
-        "distance_m": np.linalg.norm(to_drone_m, axis=1),
-        "clean_altitude_m": clean_m[:, 2] + TARGET_HEIGHT_M,
-        "clean_distance_m": np.linalg.norm(clean_m, axis=1),
+        "height_m": to_drone_m[:, 2], "distance_m": np.linalg.norm(to_drone_m, axis=1),
+        "clean_altitude_m": clean_m[:, 2] + TARGET_HEIGHT_M, "clean_distance_m": np.linalg.norm(clean_m, axis=1),
         "visibility": frames.visibility,
         **{name: np.array([len(row[name] or "") for row in captioned], float) for name in CAPTION_FIELDS},
-    }
+    }  # fmt: skip
     return TrackCount(
         name=frames.name, **{name: first[name] for name in ("track", "split", "walk", "pair")}, frames=len(rows),
         points=len(points), frames_digest=frames_digest(frames.index),
@@ -200,9 +198,7 @@ def _counts(frames: TrackRows, points: TrackRows, captioned: list[dict[str, Any]
         if any(sky):
             counts["sky"][TAB.join(preset_token(name) if name else "not known" for name in sky)] += 1
     events = (event for row in rows for event in (row["perturbation"] or {}).items())
-    counts["events"] = Counter(
-        f"{first['track']}{TAB}{event}{TAB}{outcome}" for event, outcome in events if outcome is not None
-    )
+    counts["events"] = Counter(f"{first['track']}{TAB}{event}{TAB}{text}" for event, text in events if text is not None)
     counts["states"] = Counter()
     if first["track"] == "perturbed":
         is_known = ~np.isnan(frames.drone_offset).any(axis=1)
@@ -217,11 +213,8 @@ def _counts(frames: TrackRows, points: TrackRows, captioned: list[dict[str, Any]
 
 
 def numbers_of(tracks: Sequence[TrackCount], num_frames: int) -> Numbers:
-    """Compute every number of the card and the statistics.
-
-    Args:
-        tracks: The counts of all rows, of one track at least. num_frames: The largest number of frames per track.
-    """
+    """Compute every number of the card and the statistics from the counts of at least one track; `num_frames` is the
+    setting, the most frames of a track."""
     counts = {name: _sorted(total_of(tracks, name)) for name in tracks[0].counts}
     for name in ("town", "track", "fov"):
         frames = Counter[str]()
@@ -232,11 +225,8 @@ def numbers_of(tracks: Sequence[TrackCount], num_frames: int) -> Numbers:
     trajectories = dict[str, TrackCount]()  # one track of each: the clean one if it is released
     for track in sorted(tracks, key=lambda track: track.track != "clean"):
         trajectories.setdefault(track.trajectory, track)
-    known = [
-        (track.motion["accel_rms_mps2"], track.motion["jerk_rms_mps3"])
-        for track in trajectories.values()
-        if track.motion["accel_rms_mps2"] is not None and track.motion["jerk_rms_mps3"] is not None
-    ]
+    motions = [(track.motion["accel_rms_mps2"], track.motion["jerk_rms_mps3"]) for track in trajectories.values()]
+    known = [(accel, jerk) for accel, jerk in motions if accel is not None and jerk is not None]
     scores = [smoothness_score(accel, jerk) for accel, jerk in known]
     within = sum(accel <= ACCEL_RMS_MAX_MPS2 and jerk <= JERK_RMS_MAX_MPS3 for accel, jerk in known)
     below = sum(score < REVIEW_BELOW for score in scores)

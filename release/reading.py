@@ -64,8 +64,7 @@ def _vectors(name: str, members: tuple[str, ...]) -> cached_property[np.ndarray]
 
 @dataclass(frozen=True)
 class TrackRows:
-    """The n rows of one track in the order of their frames, with the columns of a release; a column that a format lacks
-    is None everywhere."""
+    """The n rows of one track in the order of their frames; a column that a format lacks is None in all rows."""
 
     name: str  # run/town/trajectory/variant
     rows: Sequence[Row]
@@ -187,11 +186,8 @@ def bounded(value: float) -> float:
 
 
 def row_lists(shard: Path, columns: Sequence[str], *, strict: bool = True) -> Iterator[list[dict[str, Any]]]:
-    """Yield the rows of a parquet file of a release, a row group at a time.
-
-    Args:
-        strict: Raise InputError if a value that must be there is null, or a number is not finite.
-    """
+    """Yield the rows of a parquet file of a release, a row group at a time; `strict` raises InputError if a required
+    value is null or a number is not finite."""
     for group in row_groups(shard, list(columns), tree=shard.parents[1]):
         if strict:
             _check_values(group, shard)
@@ -223,13 +219,8 @@ def _check_values(group: pa.Table, shard: Path) -> None:
 def read_tracks(
     folder: Path, shard: Shard, columns: Sequence[str] = SCALAR_NAMES, *, strict: bool = True
 ) -> Iterator[tuple[TrackRows, TrackRows]]:
-    """Yield the tracks of a shard in order: the rows of the released frames, and those of all points.
-
-    Args:
-        columns: Of the frames, besides PLACE; never pictures. strict: As in `row_lists`.
-    Raises:
-        InputError: Frames and points are not of the same tracks in the same order.
-    """
+    """Yield the tracks of a shard in order: the rows of the released frames, with these columns, and those of all
+    points; InputError if these are not of the same tracks in the same order, or as in `row_lists`."""
     names = [*PLACE, *(name for name in columns if name not in PLACE)]
     tracks_of_frames = _rows_by_track(folder / shard.path, names, strict)
     tracks_of_points = _rows_by_track(folder / shard.points.path, POINT_NAMES, strict)

@@ -66,8 +66,7 @@ class ReleasedFlight(Strict):
     @property
     def town(self) -> str:
         """The town of the track, "" if the record has a flight without one."""
-        _, _, in_run = self.flight.partition("/")
-        return in_run.partition("/")[0]
+        return f"{self.flight}//".split("/")[1]
 
     @property
     def trajectory(self) -> str:
@@ -306,11 +305,7 @@ def write_record(path: Path, record: ReleaseRecord) -> None:
 
 
 def read_record(path: Path) -> ReleaseRecord:
-    """Read `release.json`.
-
-    Raises:
-        InputError: there is none, or a field is wrong, which the error names.
-    """
+    """Read `release.json`; InputError if there is none, or names the field that is wrong."""
     if not path.exists():
         raise InputError(
             "the folder is not a release", where=path, expected="the folder of a release, or of a run with a release",

@@ -56,9 +56,8 @@ SPLIT_RULE = (
 def split_flights(
     flights: Mapping[str, tuple[str, str]], by: SplitBy, fractions: Mapping[SplitName, float], seed: int
 ) -> dict[str, SplitName]:
-    """Return the split of each track, given its walk and town. Walks, or families of towns, of which no track is
-    released have no rank.
-    """
+    """Return the split of each track, given its walk and town. Walks, or families of towns, without a released track
+    have no rank."""
     shares: dict[Split, float] = {"val": fractions["validation"], "test": fractions["test"]}
     groups = {name: walk if by == "walk" else town_family(town) for name, (walk, town) in flights.items()}
     splits = assign_splits(groups.values(), shares, seed)

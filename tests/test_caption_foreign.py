@@ -24,7 +24,7 @@ from cosfly.llm.student_chat import CHAT_FORMAT_FILE, read_chat_format, write_ch
 from cosfly.runtime.errors import ConfigError, InputError
 from distill.inference import stage as infer
 from distill.schema import Sample, open_split
-from distill.training.stage import taught_by
+from distill.training.stage import chat_format_of
 from release.build import stage as package
 from release.build.sources import Source
 from release.record import read_record
@@ -140,7 +140,7 @@ def place(tmp_path_factory) -> Path:
     captions = run(CaptionConfig.model_validate({"image": {"max_side_px": SIDE_PX}}), tree, root / "rules")
     prepared(tree, captions, root / "set", modalities=("rgb", "depth"))
     (root / "trained" / "adapter").mkdir(parents=True)
-    write_chat_format(root / "trained" / "adapter", taught_by(open_split(root / "set", "train"), MAX_PIXELS))
+    write_chat_format(root / "trained" / "adapter", chat_format_of(open_split(root / "set", "train"), MAX_PIXELS))
     return root
 
 

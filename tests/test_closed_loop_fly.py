@@ -27,7 +27,7 @@ from distill.inference.answers import Completion
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split
 from distill.student.random_student import make_random_student
-from distill.training.stage import taught_by
+from distill.training.stage import chat_format_of
 from release.verify.verify import verify
 from specimens import make_playback_tree
 
@@ -178,7 +178,7 @@ def student(tmp_path_factory) -> Path:
     captions = caption_tree(CaptionConfig(), tree, root / "captions")
     prepared(tree, captions, root / "set", modalities=("rgb",))
     make_random_student(root / "model")
-    write_chat_format(root / "model", taught_by(open_split(root / "set", "train"), 64 * 64))
+    write_chat_format(root / "model", chat_format_of(open_split(root / "set", "train"), 64 * 64))
     return root / "model"
 
 

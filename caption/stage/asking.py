@@ -53,8 +53,7 @@ class AskingOutcome:
 
 
 class Asking:
-    """One run of a teacher over tracks. The captions of a finished track are its part file, those of an unfinished one
-    its gap file (tracks.py)."""
+    """One run of a teacher over tracks. Captions of a finished track are its part file, of others its gap file."""
 
     # Opened by `run`.
     teacher: Teacher
@@ -84,11 +83,7 @@ class Asking:
         self.dropped = Counter[str]()  # captions of this run by reason, before the first accepted one
 
     async def run(self, tracks: list[TrackInput]) -> AskingOutcome:
-        """Ask about every window that has no answer yet.
-
-        Raises:
-            TeacherError: No window would get an answer. Earlier answers are kept.
-        """
+        """Ask about every window that has no answer yet; TeacherError if no window would get one. Answers are kept."""
         path = self.stage.path
         guesses = [track.guess_num_windows(self.cfg.window) for track in tracks]
         try:

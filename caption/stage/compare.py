@@ -87,11 +87,8 @@ def compare(strategy: Strategy, trials: Sequence[Trial]) -> Comparison:
 
 
 def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: int = 50) -> list[Comparison]:
-    """Find so many conflicts among the free answers and regenerate each by every strategy.
-
-    Raises:
-        ConfigError: The captions come from a file. InputError: There is no conflict. TeacherError: The endpoint fails.
-    """
+    """Find so many conflicts among the free answers and regenerate each by every strategy. ConfigError: The captions
+    come from a file. InputError: There is no conflict. TeacherError: The endpoint fails."""
     if cfg.caption_file is not None:
         fix = "pass --teacher rules, a URL or vllm:MODEL_DIR"
         raise ConfigError("captions of a file cannot be regenerated", where="--teacher", got=cfg.teacher, fix=fix)
@@ -102,12 +99,9 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
         raise InputError(what, where=data, got=f"{num_windows} windows without conflict", fix=fix)
     comparisons = list(map(compare, STRATEGIES, zip(*trials, strict=True)))
     value = {
-        "schema": "cosfly.compare_strategies",
-        "schema_version": "2.0",
-        "teacher": cfg.teacher_kind,
-        "windows": num_windows,
-        "strategies": [asdict(comparison) for comparison in comparisons],
-    }
+        "schema": "cosfly.compare_strategies", "schema_version": "2.0", "teacher": cfg.teacher_kind,
+        "windows": num_windows, "strategies": [asdict(comparison) for comparison in comparisons],
+    }  # fmt: skip
     write_json(out / RESULT, value)
     return comparisons
 

@@ -35,11 +35,8 @@ MOST_LOGGED = 200  # characters of an answer that are logged when it arrives
 
 
 def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *, seed: int = 0) -> Iterator[str]:
-    """Yield the lines that show a few windows: each question and answer, and what became of the window.
-
-    Raises:
-        TeacherError: No window gets an answer.
-    """
+    """Yield the lines that show a few windows: each question and answer, and the outcome of the window; TeacherError if
+    no window gets an answer."""
     if cfg.teacher_kind in EMBEDDED:
         what, expected = "this teacher asks no model", "--teacher URL or --teacher vllm:MODEL_DIR"
         raise ConfigError(what, where="--try", got=f"--teacher {cfg.teacher}", expected=expected)

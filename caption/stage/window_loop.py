@@ -34,11 +34,8 @@ CONTRADICTED = "contradicted_value"
 async def caption_window(
     window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary, judge: Judge | None = None
 ) -> Caption:
-    """Make the caption of one window.
-
-    Raises:
-        NoAnswer: The teacher gave none, but may later. TeacherError: No window will get an answer.
-    """
+    """Make the caption of one window. NoAnswer: The teacher gave none, but may later. TeacherError: No window will get
+    an answer."""
     loop = WindowLoop(window, teacher, cfg, vocabulary, judge)
     reason = window.problem
     if reason is None:
@@ -233,9 +230,7 @@ class WindowLoop:
         """
         english = self.english.coc
         flight_data = question.prompts["en"].told(replace(question.pictures, views=()).sentence("en")).user
-        conflict = Conflict(
-            sample_id=question.window.sample_id, flight_data=flight_data, answer=english, label=self.label
-        )
+        conflict = Conflict(sample_id=self.caption.sample_id, flight_data=flight_data, answer=english, label=self.label)
         self.caption.judge = judgement = await judge.judge(conflict)
         if judgement.verdict == "ACCEPT_ALTERNATIVE":
             is_hard = self.caption.verdict == "HARD_CONFLICT"

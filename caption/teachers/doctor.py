@@ -57,10 +57,7 @@ def examine_endpoint(
     url: str, cfg: CaptionConfig, vocabulary: Vocabulary, most_requests: int | None = None
 ) -> list[Finding]:
     """Try an endpoint, with at most `most_requests`, and show the progress. It is usable if no finding is `unusable`.
-
-    Raises:
-        TeacherError: The URL cannot be asked.
-    """
+    TeacherError: The URL cannot be asked."""
     # A greeting, the schema, a prompt with pictures and one without, the largest prompt, a longer one.
     num_requests = 1 + bool(cfg.endpoint.json_schema) + 2 * bool(cfg.num_images) + 2
     with progress_bar("doctor", num_requests) as advance:

@@ -61,13 +61,11 @@ def own_prompts(folder: Path) -> dict[str, str]:
     for problem in problems:
         log.error("%s", problem)
     if problems:
+        got = problems[0] + (f", and {len(problems) - 1} more" if problems[1:] else "")
         raise ConfigError(
-            "these prompts cannot be used",
-            where=folder,
-            got=problems[0] + (f", and {len(problems) - 1} more" if problems[1:] else ""),
-            expected="the files and slots of the built-in prompts",
-            fix=f"{len(problems)} to fix; {export}",
-        )
+            "these prompts cannot be used", where=folder, got=got,
+            expected="the files and slots of the built-in prompts", fix=f"{len(problems)} to fix; {export}",
+        )  # fmt: skip
     return prompts
 
 
@@ -95,17 +93,15 @@ def slots_of(text: str) -> list[str]:
 
 
 def export_prompts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
-    """Write prompts into a folder; return their paths. Existing files must have the same text.
-
-    Files of the same text can be there from an interrupted export.
-    """
+    """Write prompts into a folder; return their paths. Existing files, as of an interrupted export, must have the same
+    text."""
     with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     paths = {folder / f"{name}{SUFFIX}": text for name, text in texts.items()}
-    others = [path.name for path, text in paths.items() if path.exists() and read_text(path) != text]
-    if others:
+    different = [path.name for path, text in paths.items() if path.exists() and read_text(path) != text]
+    if different:
         what, fix = "the folder already contains prompts with a different text", "choose another folder"
-        raise ConfigError(what, where=folder, got=", ".join(others), fix=fix)
+        raise ConfigError(what, where=folder, got=", ".join(different), fix=fix)
     for path, text in paths.items():
         write_bytes(path, text.encode())
     return list(paths)

@@ -104,11 +104,7 @@ class TrainedStudent:
         self, question: Question, language: Language, decision: str | None, frames: Frames, seed: int
     ) -> Request:
         """Return the request in one language; a student does not translate. In English a regeneration adds its sentences
-        to the system prompt, although the training had none of them.
-
-        Raises:
-            TeacherError: The window has other pictures than those of the training.
-        """
+        to the system prompt, although the training had none. TeacherError: The training had other pictures."""
         pictures = question.pictures
         trained_with = {(look.views, look.size_px) for look in self.chat_format.looks}
         if (pictures.views, pictures.size_px) not in trained_with:

@@ -116,17 +116,12 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
     seen = tuple([distance_m is not None for distance_m in by_frame["distance_m"]])
     step_s = (frames[-1].time_s - frames[0].time_s) / (len(frames) - 1)
     return Facts(
-        **by_frame,
-        **_measure_drone(frames, step_s),
-        **_measure_target(frames, seen, step_s),
-        width_px=picture_px[0],
-        height_px=picture_px[1],
-        step_s=round(step_s, 3),
-        mission=window.mission,
+        **by_frame, **_measure_drone(frames, step_s), **_measure_target(frames, seen, step_s), width_px=picture_px[0],
+        height_px=picture_px[1], step_s=round(step_s, 3), mission=window.mission,
         others_in_view=_rounded([frame.others_in_view for frame in frames], None),
         other_distance_m=_rounded([frame.other_distance_m for frame in frames], 1),
         alike_differences=_rounded([frame.alike_differences for frame in frames], None),
-    )
+    )  # fmt: skip
 
 
 def _forward_left(x: float, y: float, current: ObservedFrame) -> tuple[float, float]:
@@ -271,22 +266,20 @@ def _measure_frame(frame: ObservedFrame, camera_px: tuple[int, int], picture_px:
     distance = math.hypot(away_x, away_y)
     x_scale, y_scale = picture_px[0] / camera_px[0], picture_px[1] / camera_px[1]
     left, top, right, bottom = frame.target_bbox
-    left, top, right, bottom = left * x_scale, top * y_scale, right * x_scale, bottom * y_scale
+    left, right = left * x_scale, right * x_scale
+    top, bottom = top * y_scale, bottom * y_scale
     # The centre of the box is where the person is seen; uv (the hip) replaces it where a tree has no box.
     centre_x, centre_y = (left + right) / 2.0, (top + bottom) / 2.0
     if math.isnan(left):
         centre_x, centre_y = frame.target_uv[0] * x_scale, frame.target_uv[1] * y_scale
     return facts | {
-        "distance_m": _round(distance, 1),
-        "slant_m": _round(math.hypot(distance, away_z), 1),
+        "distance_m": _round(distance, 1), "slant_m": _round(math.hypot(distance, away_z), 1),
         "height_over_target_m": _round(-away_z, 1),
         "bearing_deg": _round(wrap_deg(math.degrees(math.atan2(away_y, away_x)) - heading), 1),
-        "depression_deg": _round(math.degrees(math.atan2(-away_z, distance)), 1),
-        "box_width_px": _round(right - left),
-        "box_height_px": _round(bottom - top),
-        "offset_x_px": _round(centre_x - picture_px[0] / 2.0),
+        "depression_deg": _round(math.degrees(math.atan2(-away_z, distance)), 1), "box_width_px": _round(right - left),
+        "box_height_px": _round(bottom - top), "offset_x_px": _round(centre_x - picture_px[0] / 2.0),
         "offset_y_px": _round(centre_y - picture_px[1] / 2.0),
-    }
+    }  # fmt: skip
 
 
 def _round(value: float, digits: int | None = None) -> Any:

@@ -137,8 +137,7 @@ def ends_of_clauses(language: Language) -> re.Pattern[str]:
 
 
 def is_negated(text: str, start: int, language: Language) -> bool:
-    """Return whether a negation stands just before a place of a text (English in small letters): within two words of
-    its clause."""
+    """Return whether one of the two words before a place of a text, in small letters, is a negation."""
     negations = _glossary()["negations"][language]
     if language == "zh":
         return text[max(0, start - 4) : start].endswith(tuple(negations))

@@ -61,8 +61,7 @@ def _numbers(texts: Sequence[str], language: Language) -> list[Numeral]:
 
 
 def _is_shared(number: Numeral, others: Sequence[Numeral], measured: dict[str, list[Series]]) -> bool:
-    """Return whether a number occurs in the other language or in a measured series, or is a difference of two numbers
-    of one of these."""
+    """Return whether a number is in the other language or measured, or the difference of two such numbers."""
     if not number.unit and number.digits == 0 and number.value < 10:
         return True  # a count ("5 frames"), which the other language may write as a word
     candidates: list[Series] = [[other.value for other in others if not number.unit or other.unit in ("", number.unit)]]

@@ -196,8 +196,7 @@ def _matches(numeral: Numeral, fact: float, rounding: float) -> bool:
 
 
 def measured_lines(facts: Facts, contradictions: Sequence[str]) -> str:
-    """Return what was measured of the quantities that contradictions name, for the teacher to correct its text; of all
-    quantities if they name none."""
+    """Return the measured values of the quantities that contradictions name, of all quantities if they name none."""
     quantities = {
         "altitude": ("altitude", facts.altitude_m, "m"),
         "distance": ("horizontal distance", facts.distance_m, "m"),

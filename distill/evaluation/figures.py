@@ -1,8 +1,8 @@
 """Figures of students and baselines, with bootstrap intervals over pedestrian trajectories.
 
-A sample without an answer (a picture could not be read, a server refused) is not a wrong answer. An answer that does
-not parse is one: it decides nothing, and its texts score 0. Windows of a track overlap and languages share windows, so
-whole pedestrian trajectories are drawn, and everybody is measured on the same draws.
+A sample without an answer (a picture could not be read, a server refused) does not count as a wrong answer. An answer
+that does not parse does: it has no decision, and its texts score 0. Windows of a track overlap and languages share
+windows, so whole pedestrian trajectories are drawn, and everybody is measured on the same draws.
 """
 
 from collections import Counter
@@ -49,11 +49,11 @@ FIGURES = {
 
 
 class FigureSet(Record):
-    """Figures of one author by name (FIGURES), accuracy by decision, reference -> answers (students only)."""
+    """The figures of one author."""
 
-    figures: dict[str, Figure]
-    by_decision: dict[str, Figure]
-    confusion: dict[str, dict[str, int]]
+    figures: dict[str, Figure]  # by name (FIGURES)
+    by_decision: dict[str, Figure]  # accuracy by the teacher's decision
+    confusion: dict[str, dict[str, int]]  # the teacher's decision -> the answer -> samples; of students only
 
 
 class Pairing(Record):
@@ -65,11 +65,11 @@ class Pairing(Record):
 
 
 class Measurement(Record):
-    """Figures on the samples of one language. who: students, teacher, baselines."""
+    """Figures on the samples of one language."""
 
     samples: int
     walks: int
-    who: dict[str, FigureSet]
+    who: dict[str, FigureSet]  # of students, teacher, baselines
     pairings: list[Pairing]
 
 
@@ -94,20 +94,15 @@ def decision_number(decision: str, where: str) -> int:
 
 @dataclass(frozen=True)
 class Answers:
-    """The answers of one author to n samples.
+    """The answers of one author to n samples."""
 
-    decision: (n,) number in TOKENS, or UNPARSED. is_answered, is_unchanged: (n,) bool, the second if an answer parses
-    without corrections. num_tokens: (n,), 0 if unknown. values: (n, 2) numbers of matched and contradicted values, NaN
-    if unknown. scores: (n, 3) BERTScore, NaN if not computed. texts: (n,) str, "" for none.
-    """
-
-    decision: np.ndarray
-    is_answered: np.ndarray
-    is_unchanged: np.ndarray
-    num_tokens: np.ndarray
-    values: np.ndarray
-    scores: np.ndarray
-    texts: np.ndarray
+    decision: np.ndarray  # (n,) number in TOKENS, or UNPARSED
+    is_answered: np.ndarray  # (n,) bool
+    is_unchanged: np.ndarray  # (n,) bool, the answer parses without corrections
+    num_tokens: np.ndarray  # (n,), 0 if unknown
+    values: np.ndarray  # (n, 2) numbers of matched and contradicted values, NaN if unknown
+    scores: np.ndarray  # (n, 3) BERTScore, NaN if not computed
+    texts: np.ndarray  # (n,) str, "" for none
 
     @classmethod
     def of(cls, decision: np.ndarray, texts: Sequence[str] = ()) -> Self:
@@ -149,16 +144,12 @@ def ratios_of(samples: Sequence[Sample], answers: Answers) -> Ratios:
     scored = answered & ~np.isnan(answers.scores[:, 0])
     values = np.nan_to_num(answers.values) * answered[:, None]
     ratios: Ratios = {
-        "answered": (answered, np.ones(len(samples))),
-        "parsed": (parsed, answered),
-        "parsed_unchanged": (answers.is_unchanged & answered, answered),
-        "accuracy": (right, answered),
-        "accuracy_parsed": (right, parsed),
-        "accuracy_on_labels": (labelled & (answer == labels), labelled),
-        "values_matched": (values[:, 0], values.sum(axis=1)),
-        "values_contradicted": (values[:, 1], values.sum(axis=1)),
+        "answered": (answered, np.ones(len(samples))), "parsed": (parsed, answered),
+        "parsed_unchanged": (answers.is_unchanged & answered, answered), "accuracy": (right, answered),
+        "accuracy_parsed": (right, parsed), "accuracy_on_labels": (labelled & (answer == labels), labelled),
+        "values_matched": (values[:, 0], values.sum(axis=1)), "values_contradicted": (values[:, 1], values.sum(axis=1)),
         "tokens": (answers.num_tokens * answered, answered & (answers.num_tokens > 0)),
-    }
+    }  # fmt: skip
     ratios |= {verdict.lower(): (judged & (verdicts == verdict), judged) for verdict in VERDICTS}
     for k, name in enumerate(BERTSCORE):
         ratios[name] = (np.where(scored, answers.scores[:, k], 0.0), scored)
@@ -170,22 +161,19 @@ def ratios_of(samples: Sequence[Sample], answers: Answers) -> Ratios:
 
 
 def values_of(ratios: Ratios, walk: np.ndarray, draws: np.ndarray) -> dict[str, np.ndarray]:
-    """Return each figure on each draw, (draws,); NaN if nothing of the kind occurs.
-
-    Args:
-        walk: (n,) number of each sample's pedestrian trajectory. draws: (draws, walks) how often each is drawn.
-    """
+    """Return each figure on each draw, (draws,); NaN if nothing of the kind occurs. walk: (n,) number of each sample's
+    pedestrian trajectory. draws: (draws, walks), how often each of these is drawn."""
     num_walks = draws.shape[1]
     sums = np.array([[np.bincount(walk, part, num_walks) for part in pair] for pair in ratios.values()])
     numerators, denominators = (draws @ sums[:, k].T for k in range(2))
     with np.errstate(invalid="ignore", divide="ignore"):
         values = np.where(denominators > 0, numerators / denominators, np.nan)
-    found = dict(zip(ratios, values.T, strict=True))
-    occurs = ~np.isnan([found[f"decision/{token}"] for token in TOKENS])  # in the references of a draw
-    scores = np.where(occurs, [found[f"f1/{token}"] for token in TOKENS], 0.0)
+    figures = dict(zip(ratios, values.T, strict=True))
+    occurs = ~np.isnan([figures[f"decision/{token}"] for token in TOKENS])  # in the references of a draw
+    scores = np.where(occurs, [figures[f"f1/{token}"] for token in TOKENS], 0.0)
     num_decisions = occurs.sum(axis=0)
-    found["macro_f1"] = np.where(num_decisions > 0, scores.sum(axis=0) / np.maximum(num_decisions, 1), np.nan)
-    return found
+    figures["macro_f1"] = np.where(num_decisions > 0, scores.sum(axis=0) / np.maximum(num_decisions, 1), np.nan)
+    return figures
 
 
 def measure(
@@ -195,34 +183,33 @@ def measure(
     names, walk = np.unique([sample.walk for sample in samples], return_inverse=True)
     draws = np.vstack([np.ones(len(names)), draw_pedestrians(len(names), RESAMPLES, rng)])  # the first: all samples
     ratios = {name: ratios_of(samples, answers) for name, answers in everyone.items()}
-    values = {name: values_of(own, walk, draws) for name, own in ratios.items()}
+    values = {name: values_of(ratios_of_one, walk, draws) for name, ratios_of_one in ratios.items()}
 
-    def figure(name: str, drawn: np.ndarray, count: float) -> Figure:
-        return figure_of_draws(float(drawn[0]), drawn[1:], int(count), len(names), CONFIDENCE)
+    def figure(on_draws: np.ndarray, count: float) -> Figure:
+        return figure_of_draws(float(on_draws[0]), on_draws[1:], int(count), len(names), CONFIDENCE)
 
     who = {}
     pairings = []
-    for name, own in values.items():
-        counts = {key: pair[1].sum() for key, pair in ratios[name].items()}
+    for name, by_key in values.items():
+        counts = {key: denominator.sum() for key, (_, denominator) in ratios[name].items()}
         counts["macro_f1"] = counts["accuracy"]
-        figures = {key: figure(key, own[key], counts[key]) for key in FIGURES}
-        found = {token: figure(token, own[f"decision/{token}"], counts[f"decision/{token}"]) for token in TOKENS}
-        by_decision = {token: one for token, one in found.items() if one.count}
-        confusion = _confusion(samples, everyone[name]) if name in students else {}
-        who[name] = FigureSet(figures=figures, by_decision=by_decision, confusion=confusion)
+        by_decision = {token: figure(by_key[f"decision/{token}"], counts[f"decision/{token}"]) for token in TOKENS}
+        who[name] = FigureSet(
+            figures={key: figure(by_key[key], counts[key]) for key in FIGURES},
+            by_decision={token: accuracy for token, accuracy in by_decision.items() if accuracy.count},
+            confusion=_confusion(samples, everyone[name]) if name in students else {},
+        )
     for first, second in combinations(students, 2):
-        differences = {key: values[first][key] - values[second][key] for key in FIGURES}
-        found = {key: figure(key, drawn, len(samples)) for key, drawn in differences.items()}
-        pairings.append(Pairing(first=first, second=second, differences=found))
+        differences = {key: figure(values[first][key] - values[second][key], len(samples)) for key in FIGURES}
+        pairings.append(Pairing(first=first, second=second, differences=differences))
     return Measurement(samples=len(samples), walks=len(names), who=who, pairings=pairings)
 
 
 def _confusion(samples: Sequence[Sample], answers: Answers) -> dict[str, dict[str, int]]:
-    names = (*TOKENS, UNPARSED_NAME)  # UNPARSED is the last place
-    cells = Counter(
-        (sample.decision, names[number])
-        for sample, number, is_answered in zip(samples, answers.decision.tolist(), answers.is_answered, strict=True)
-        if is_answered
-    )
-    rows = [token for token in TOKENS if any(reference == token for reference, _ in cells)]
-    return {row: {name: cells[row, name] for name in names if cells[row, name]} for row in rows}
+    """Return the teacher's decision -> the answer -> number of samples, without zeros."""
+    names = (*TOKENS, UNPARSED_NAME)  # UNPARSED, -1, is the last index
+    table: dict[str, Counter[str]] = {token: Counter() for token in TOKENS}
+    for sample, number, is_answered in zip(samples, answers.decision.tolist(), answers.is_answered, strict=True):
+        if is_answered:
+            table[sample.decision][names[number]] += 1
+    return {token: {name: row[name] for name in names if row[name]} for token, row in table.items() if row}

@@ -25,6 +25,7 @@ SUMMARY = ("parsed", "accuracy", "accuracy_on_labels", "macro_f1", "bertscore_f1
 LANGUAGES: dict[Language, str] = {"en": "English", "zh": "Chinese"}
 # The paper's students: tab:distillation_summary, and the accuracies in the text of
 # sec:appendix_f_caption_distillation.
+PAPER_SAMPLES = 10_000
 PAPER: dict[str, dict[str, float]] = {
     "paper: Qwen3.5-2B + LoRA": {
         "parsed": 1.0, "accuracy": 0.6870, "accuracy_parsed": 0.6870, "bertscore_precision": 0.9282,
@@ -50,25 +51,22 @@ NOTES = [
 
 
 class Metric(Record):
-    """What a score was measured with; `stage.json` has the digests. cut: References longer than max_tokens."""
+    """What a score was measured with; `stage.json` has the digests."""
 
     model: str
     layer: int
     max_tokens: int
-    cut: int
+    cut: int  # references longer than max_tokens
     versions: dict[str, str]
 
 
 class StudentRecord(Record):
-    """The predictions of a student. not_asked: Samples of the split without one. without_decision: By reason.
-
-    samples_per_s: Of the last run of `distill infer`; None if unknown.
-    """
+    """The predictions of a student."""
 
     model: str
-    not_asked: int
-    without_decision: dict[str, int]
-    samples_per_s: float | None
+    not_asked: int  # samples of the split without a prediction
+    without_decision: dict[str, int]  # reason -> predictions
+    samples_per_s: float | None  # of the last run of `distill infer`; None if unknown
 
 
 class Example(Record):
@@ -82,30 +80,42 @@ class Example(Record):
 
 
 class Evaluation(Record):
-    """`report.json`. metrics: None if BERTScore was not computed."""
+    """`report.json`."""
 
     split: Split
     seed: int
     confidence: float = CONFIDENCE
     resamples: int = RESAMPLES
     students: dict[str, StudentRecord]
-    metrics: dict[Language, Metric | None]
+    metrics: dict[Language, Metric | None]  # None if BERTScore was not computed
     languages: dict[Language, Measurement]
     examples: list[Example]
 
 
 def _paper() -> dict[str, FigureSet]:
-    found = {}
-    for who, values in PAPER.items():
-        own = {name: Figure(value=values.get(name), low=None, high=None, count=10_000) for name in (*FIGURES, *TOKENS)}
-        figures, by_decision = ({name: own[name] for name in names} for names in (FIGURES, TOKENS))
-        found[who] = FigureSet(figures=figures, by_decision=by_decision, confusion={})
-    return found
+    """Return the figures of the paper's students, without intervals."""
+
+    def figure(values: dict[str, float], name: str) -> Figure:
+        return Figure(value=values.get(name), low=None, high=None, count=PAPER_SAMPLES)
+
+    return {
+        student: FigureSet(
+            figures={name: figure(values, name) for name in FIGURES},
+            by_decision={token: figure(values, token) for token in TOKENS},
+            confusion={},
+        )
+        for student, values in PAPER.items()
+    }
 
 
 def _shown(name: str, figure: Figure | None, *, signed: bool = False) -> str:
-    digits = ".4f" if name in (*BERTSCORE, "macro_f1") else ".1f" if name == "tokens" else ".1%"
-    return "-" if figure is None else figure.shown(f"{'+' if signed else ''}{digits}")
+    """Return the text of a figure of this name."""
+    if figure is None:
+        return "-"
+    digits = ".1f" if name == "tokens" else ".1%"
+    if name in (*BERTSCORE, "macro_f1"):
+        digits = ".4f"
+    return figure.shown(f"{'+' if signed else ''}{digits}")
 
 
 def tables_of(report: Evaluation, language: Language) -> list[TextTable]:
@@ -117,22 +127,22 @@ def tables_of(report: Evaluation, language: Language) -> list[TextTable]:
     labels = {name: name if name in report.students or name == TEACHER else f"baseline: {name}" for name in part.who}
     columns = {label: part.who[name] for name, label in labels.items()} | _paper()
     encoder = f" ({metric.model} layer {metric.layer})" if metric else ""
-    main = [
-        [words + encoder * (name in BERTSCORE), *(_shown(name, own.figures[name]) for own in columns.values())]
-        for name, words in FIGURES.items()
-        if any(own.figures[name].value is not None for own in part.who.values())
-    ]
+    main = []
+    for name, words in FIGURES.items():
+        if any(figure_set.figures[name].value is not None for figure_set in part.who.values()):
+            title = words + encoder if name in BERTSCORE else words
+            main.append([title, *(_shown(name, figure_set.figures[name]) for figure_set in columns.values())])
     counts = {token: figure.count for token, figure in part.who[TEACHER].by_decision.items()}
-    decisions = [
-        [f"{token} ({counts[token]})", *(_shown(token, own.by_decision.get(token)) for own in columns.values())]
-        for token in sorted(counts, key=lambda token: -counts[token])
-    ]
+    decisions = []
+    for token in sorted(counts, key=lambda token: -counts[token]):
+        cells = [_shown(token, figure_set.by_decision.get(token)) for figure_set in columns.values()]
+        decisions.append([f"{token} ({counts[token]})", *cells])
     heading = f"{LANGUAGES[language]}: {part.samples} samples of {part.walks} pedestrian trajectories"
     tables = [TextTable(heading, ["", *columns], main)]
     tables.append(TextTable("Accuracy by the teacher's decision", ["", *columns], decisions))
     for pairing in part.pairings:
-        found = {name: figure for name, figure in pairing.differences.items() if figure.value is not None}
-        rows = [[FIGURES[name], _shown(name, figure, signed=True)] for name, figure in found.items()]
+        known = {name: figure for name, figure in pairing.differences.items() if figure.value is not None}
+        rows = [[FIGURES[name], _shown(name, figure, signed=True)] for name, figure in known.items()]
         tables.append(TextTable(f"{pairing.first} minus {pairing.second}", ["", "difference"], rows))
     return tables
 
@@ -168,8 +178,8 @@ def notes_of(report: Evaluation) -> list[str]:
         if student.not_asked:
             facts.append(f"{student.not_asked} samples of the split have no prediction")
         notes.append("; ".join([f"{name} is {student.model}", *facts]) + ".")
-    everyone = [own for part in report.languages.values() for own in part.who.values()]
-    if all(own.figures["values_matched"].value is None for own in everyone):
+    everyone = [figure_set for part in report.languages.values() for figure_set in part.who.values()]
+    if all(figure_set.figures["values_matched"].value is None for figure_set in everyone):
         notes.append("Values were not checked; pass the captions of cosfly caption --teacher student:PATH as --judged.")
     return notes
 

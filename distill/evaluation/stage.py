@@ -39,24 +39,16 @@ JudgedValues = dict[tuple[str | None, str, str, str], ValueCounts]
 
 
 def run(
-    predictions: Sequence[Path],
-    dataset: Path,
-    out: Path,
-    *,
-    encoders: Mapping[Language, Path] | None = None,
-    judged: Sequence[Path] = (),
-    seed: int = 0,
-) -> Path:
-    """Read the predictions of students and their training set; write `report.json` and a page.
+    predictions: Sequence[Path], dataset: Path, out: Path, *,
+    encoders: Mapping[Language, Path] | None = None, judged: Sequence[Path] = (), seed: int = 0,
+) -> Path:  # fmt: skip
+    """Read the predictions of students and their training set; write `report.json`, whose path is returned, and a page.
 
     Args:
         predictions: `predictions.jsonl` of each student or its folder; the folder's name is the student's. Students are
             measured on the samples that all of them were asked.
         encoders: folders of the encoders of BERTScore; a language without one is not scored, and the report says so.
         judged: captions that `cosfly caption --teacher student:PATH` made of the answers.
-
-    Returns:
-        The path of `report.json`.
 
     Raises:
         InputError: an input is missing, or predictions and training set do not belong together.
@@ -75,58 +67,63 @@ def run(
     stage = StageFolder.open(out, STAGE, config=Config(), inputs=inputs, seed=seed)
     if stage.is_complete:
         return out / REPORT
-    found = {name: {p.key: p for p in read_predictions(path)} for name, path in files.items()}
-    splits = sorted({p.split for own in found.values() for p in own.values()})
+    by_student = {name: {prediction.key: prediction for prediction in read_predictions(p)} for name, p in files.items()}
+    splits = sorted({prediction.split for by_key in by_student.values() for prediction in by_key.values()})
     if len(splits) != 1:
         fix = "pass predictions of one split"
         raise InputError("the predictions are not of one split", got=f"splits: {', '.join(splits) or 'none'}", fix=fix)
-    samples, train, values = open_split(dataset, splits[0]), open_split(dataset, "train"), read_judged(judged)
-    asked = asked_samples(samples, found)
-    students: dict[str, StudentRecord] = {}
-    for name, own in found.items():
-        answers = [own[sample.key] for sample in asked]
-        reasons = Counter(answer.reason or "unknown" for answer in answers if answer.coc is None)
-        record = read_manifest(files[name].parent).facts if files[name].with_name("manifest.json").is_file() else {}
-        speed = {"answers": 0, "seconds": 0.0} | (record.get("speed") or {})  # of the last run of `distill infer`
-        students[name] = StudentRecord(
-            model=", ".join(sorted({answer.model or "unknown" for answer in answers})),
-            not_asked=len(samples) - len(own),
-            without_decision=dict(sorted(reasons.items())),
-            samples_per_s=speed["answers"] / speed["seconds"] if speed["answers"] and speed["seconds"] else None,
+    (split,) = splits
+    samples, train, values = open_split(dataset, split), open_split(dataset, "train"), read_judged(judged)
+    asked = asked_samples(samples, by_student)
+    students = {
+        name: _student_record(files[name].parent, [by_key[sample.key] for sample in asked], len(samples) - len(by_key))
+        for name, by_key in by_student.items()
+    }
+    languages = sorted({sample.language for sample in asked})
+    measurements: dict[Language, Measurement] = {}
+    metrics: dict[Language, Metric | None] = {}
+    examples: list[Example] = []
+    for language in languages:
+        part = [sample for sample in asked if sample.language == language]
+        measurements[language], metrics[language] = measure_language(
+            part, by_student, train, encoders.get(language), values, seed
         )
-    by_language = {
-        language: [sample for sample in asked if sample.language == language]
-        for language in sorted({sample.language for sample in asked})
-    }
-    most = NUM_EXAMPLES // len(by_language)
-    measured = {
-        language: measure_language(part, found, train, encoders.get(language), values, seed)
-        for language, part in by_language.items()
-    }
+        examples += _examples(part, by_student, NUM_EXAMPLES // len(languages), seed)
     report = Evaluation(
-        split=splits[0], seed=seed, students=students,
-        metrics={language: metric for language, (_, metric) in measured.items()},
-        languages={language: measurement for language, (measurement, _) in measured.items()},
-        examples=[example for part in by_language.values() for example in _examples(part, found, most, seed)],
-    )  # fmt: skip
+        split=split, seed=seed, students=students, metrics=metrics, languages=measurements, examples=examples
+    )
     write_model(out / REPORT, report, REPORT_FORMAT)
     write_bytes(out / "evaluation.html", page_of(report).encode())
-    num_left = len(samples) - len(asked)
-    tally = Tally(input=len(samples), kept=len(asked), dropped={"not_asked": num_left} if num_left else {})
-    products = [out / REPORT, out / "evaluation.html"]
-    stage.finish(products, tally, split=splits[0], models={name: one.model for name, one in report.students.items()})
+    num_not_asked = len(samples) - len(asked)
+    dropped = {"not_asked": num_not_asked} if num_not_asked else {}
+    tally = Tally(input=len(samples), kept=len(asked), dropped=dropped)
+    models = {name: student.model for name, student in students.items()}
+    stage.finish([out / REPORT, out / "evaluation.html"], tally, split=split, models=models)
     return out / REPORT
+
+
+def _student_record(folder: Path, answers: Sequence[Prediction], num_not_asked: int) -> StudentRecord:
+    """Return the record of a student, whose folder may have the manifest of `distill infer`."""
+    reasons = Counter(answer.reason or "unknown" for answer in answers if answer.coc is None)
+    facts = read_manifest(folder).facts if (folder / "manifest.json").is_file() else {}
+    speed = {"answers": 0, "seconds": 0.0} | (facts.get("speed") or {})  # of the last run
+    return StudentRecord(
+        model=", ".join(sorted({answer.model or "unknown" for answer in answers})),
+        not_asked=num_not_asked,
+        without_decision=dict(sorted(reasons.items())),
+        samples_per_s=speed["answers"] / speed["seconds"] if speed["answers"] and speed["seconds"] else None,
+    )
 
 
 def asked_samples(samples: Sequence[Sample], predictions: Predictions) -> list[Sample]:
     """Return the samples that every student was asked, in the order of the split."""
     keys = {sample.key for sample in samples}
-    for name, own in predictions.items():
-        if unknown := own.keys() - keys:
+    for name, by_key in predictions.items():
+        if unknown := by_key.keys() - keys:
             what = "the training set does not contain this sample, for which there is a prediction"
             fix = "pass the training set for which the predictions were made"
             raise InputError(what, where=f"{name}: {min(unknown)}", got=f"{len(unknown)} unknown samples", fix=fix)
-    asked = [sample for sample in samples if all(sample.key in own for own in predictions.values())]
+    asked = [sample for sample in samples if all(sample.key in by_key for by_key in predictions.values())]
     if not asked:
         raise InputError("the students have no sample in common", got=f"predictions of {', '.join(predictions)}")
     return asked
@@ -134,30 +131,28 @@ def asked_samples(samples: Sequence[Sample], predictions: Predictions) -> list[S
 
 def read_judged(paths: Sequence[Path]) -> JudgedValues:
     """Read the counts of values in students' texts from the captions that were made of them."""
-    found: JudgedValues = {}
+    judged: JudgedValues = {}
     for path in paths:
         for caption in read_captions(path):
             for language, counts in (caption.checks.values or {}).items():
                 text = text_of(caption.en if language == "en" else caption.zh)
-                found[caption.teacher.run, caption.sample_id, language, text] = counts
-    return found
+                judged[caption.teacher.run, caption.sample_id, language, text] = counts
+    return judged
 
 
 def measure_language(
-    samples: Sequence[Sample],
-    predictions: Predictions,
-    train: Collection[Sample],
-    encoder: Path | None,
-    judged: JudgedValues,
-    seed: int,
-) -> tuple[Measurement, Metric | None]:
+    samples: Sequence[Sample], predictions: Predictions, train: Collection[Sample], encoder: Path | None,
+    judged: JudgedValues, seed: int,
+) -> tuple[Measurement, Metric | None]:  # fmt: skip
     """Measure students, teacher and baselines on samples of one language that all students were asked."""
     everyone: dict[str, Answers] = {}
-    for name, own in predictions.items():
-        asked = [own[sample.key] for sample in samples]
-        keys = [(s.window_id, s.language, text_of(p.coc)) for s, p in zip(samples, asked, strict=True)]
-        values = [judged.get((s.run, *key)) or judged.get((None, *key)) for s, key in zip(samples, keys, strict=True)]
-        everyone[name] = Answers.of_student(asked, values)
+    for name, by_key in predictions.items():
+        answers = [by_key[sample.key] for sample in samples]
+        values: list[ValueCounts | None] = []
+        for sample, answer in zip(samples, answers, strict=True):
+            key = (sample.window_id, sample.language, text_of(answer.coc))
+            values.append(judged.get((sample.run, *key)) or judged.get((None, *key)))
+        everyone[name] = Answers.of_student(answers, values)
     everyone |= floors_of(train, samples, samples[0].language, seed)
     metric = None
     if encoder is not None:
@@ -172,9 +167,9 @@ def measure_language(
 
 def _examples(samples: Sequence[Sample], predictions: Predictions, most: int, seed: int) -> Iterator[Example]:
     """Yield samples with everybody's answers, chosen by the seed."""
-    for place in rng_for(seed, STAGE, "examples").permutation(len(samples))[:most].tolist():
-        sample = samples[place]
-        answers = {name: own[sample.key] for name, own in predictions.items()}
+    for index in rng_for(seed, STAGE, "examples").permutation(len(samples))[:most].tolist():
+        sample = samples[index]
+        answers = {name: by_key[sample.key] for name, by_key in predictions.items()}
         yield Example(key=sample.key, walk=sample.walk, label=sample.label, reference=coc_of(sample), answers=answers)
 
 
@@ -196,13 +191,10 @@ class Scorer:
     """BERTScore with one encoder."""
 
     def __init__(self, folder: Path, references: Sequence[str]) -> None:
-        """Load the encoder.
+        """Load the encoder, and count the references that are too long for it.
 
         The layer is that of the library for the folder's name (17 for `roberta-large`, 8 for `bert-base-chinese`). For
         a name that the library does not know, or an encoder with fewer layers, it is the last one.
-
-        Args:
-            references: texts that are counted if they are too long.
         """
         require("torch", "transformers", "bert_score")
         quiet_transformers()
@@ -235,21 +227,18 @@ class Scorer:
         )
 
     def score(self, candidates: Mapping[str, Sequence[str]], references: Sequence[str]) -> dict[str, np.ndarray]:
-        """Score several authors' texts on the same references.
-
-        Returns:
-            author -> (n, 3) precision, recall and F1; 0 for an empty text.
-        """
+        """Score several authors' texts; return author -> precision, recall, F1, (n, 3), 0 for an empty text."""
         scores = {name: np.zeros((len(references), 3)) for name in candidates}
         pairs = [(k, name) for k, text in enumerate(references) for name in candidates if text and candidates[name][k]]
         with progress_bar(f"BERTScore, {self.metric.model}", total=len(pairs)) as advance:
             for first in range(0, len(pairs), GROUP):
-                part = pairs[first : first + GROUP]
-                texts = [candidates[name][k] for k, name in part]
-                found = self._library.score(texts, [references[k] for k, _ in part], batch_size=BATCH_SIZE)
-                for (k, name), row in zip(part, np.stack([values.numpy() for values in found], axis=1), strict=True):
+                group = pairs[first : first + GROUP]
+                texts = [candidates[name][k] for k, name in group]
+                columns = self._library.score(texts, [references[k] for k, _ in group], batch_size=BATCH_SIZE)
+                rows = np.stack([column.numpy() for column in columns], axis=1)
+                for (k, name), row in zip(group, rows, strict=True):
                     scores[name][k] = row
-                advance(len(part))
+                advance(len(group))
         return scores
 
 
@@ -271,28 +260,28 @@ def floors_of(
 ) -> dict[str, Answers]:
     """Return the answers of the teacher and of each baseline to samples of one language.
 
-    Args:
-        train: samples of the training split, in any language. Without one in `language` there are no baselines; without
-            the geometry of the past there is no rule and no network.
+    Without a training sample in `language` there are no baselines; without the geometry of the past there is no rule
+    and no network. A hash of each sample chooses the majority's text and the samples to fit to.
     """
-    counts, typical, fitted = Counter[str](), dict[str, tuple[bytes, Sample]](), list[Sample]()
-    share = FITTED_ON / max(1, len(train))
-    for sample in train:
-        if sample.language == language:
-            counts[sample.decision] += 1
-            rank = hashlib.sha256(f"{seed}/distill.floor/{sample.sample_id}".encode()).digest()
-            if sample.decision not in typical or rank < typical[sample.decision][0]:
-                typical[sample.decision] = rank, sample
-            if int.from_bytes(rank[:8]) <= share * 2**64:
-                fitted.append(sample)
-    found = {TEACHER: Answers.of(np.array([decision_number(s.decision, s.key) for s in samples]))}
-    decision = majority(counts.elements())
+    ranks = {
+        sample.key: hashlib.sha256(f"{seed}/distill.floor/{sample.sample_id}".encode()).digest()
+        for sample in train
+        if sample.language == language
+    }
+    in_language = [sample for sample in train if sample.language == language]
+    answers = {TEACHER: Answers.of(np.array([decision_number(s.decision, s.key) for s in samples]))}
+    decision = majority(sample.decision for sample in in_language)
     if decision is not None:
+        with_decision = [sample for sample in in_language if sample.decision == decision]
+        typical = min(with_decision, key=lambda sample: ranks[sample.key])
         constant = np.full(len(samples), TOKENS.index(decision))
-        found["majority"] = Answers.of(constant, [text_of(coc_of(typical[decision][1]))] * len(samples))
+        answers["majority"] = Answers.of(constant, [text_of(coc_of(typical))] * len(samples))
+    share = FITTED_ON / max(1, len(train))
+    fitted = [sample for sample in in_language if int.from_bytes(ranks[sample.key][:8]) <= share * 2**64]
     if fitted and all(sample.past for sample in (*fitted, *samples)):
-        pasts, asked = (np.array([sample.past for sample in part]) for part in (fitted, samples))
+        pasts = np.array([sample.past for sample in fitted])
         decisions = np.array([decision_number(sample.decision, sample.key) for sample in fitted])
         deciders = fit_deciders(pasts, decisions, rng_for(seed, "distill.floor", "blind"))
-        found |= {name: Answers.of(decide(asked)) for name, decide in deciders.items()}
-    return found
+        asked = np.array([sample.past for sample in samples])
+        answers |= {name: Answers.of(decide(asked)) for name, decide in deciders.items()}
+    return answers

@@ -14,12 +14,9 @@ STAGE = "distill.merge"
 
 
 def run(model: Path, adapter: Path, out: Path) -> Path:
-    """Read a base model and an adapter that was trained on it; write `model/`.
+    """Read a base model and an adapter that was trained on it; write and return `model/`, for transformers and vLLM.
 
     peft adds the update in float32, and each weight is rounded once to the type of the base.
-
-    Returns:
-        The folder `model/`, which transformers and vLLM load.
 
     Raises:
         InputError: the adapter belongs to another base, or cannot be merged.

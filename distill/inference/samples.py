@@ -70,8 +70,7 @@ class Inputs:
 
     @property
     def name(self) -> str:
-        """Name of a model that runs in this process: `run/student/model` is "student", with the adapter
-        `run/lora/adapter` it is "student+lora"."""
+        """Name by the folders: `x/student/model` is "student", with the adapter `x/lora/adapter` "student+lora"."""
         folder = Path(self.model).absolute()
         name = folder.parent.name if folder.name == "model" else folder.name
         return name if self.adapter is None else f"{name}+{self.adapter.absolute().parent.name}"
@@ -104,8 +103,7 @@ class SampleOutcome:
 def make_prediction(
     sample: Sample, split: Split, text: str = "", num_tokens: int = 0, is_finished: bool = False, *, failure: str = ""
 ) -> Prediction:
-    """Parse an answer and return its record. Without an answer, `failure` is the code of the reason; the sample is then
-    not counted as a wrong answer."""
+    """Parse an answer and return its record; `failure` is the code of the reason if there is no answer."""
     parsed = parse_answer(text, sample.language, finish_reason=None if is_finished else "length")
     return Prediction(
         **sample.model_dump(include={"sample_id", "language", "run", "window_id"}), split=split, raw=text,

@@ -62,8 +62,7 @@ def run(
 
     Every answer is recorded in a journal in `answers/` first, so nothing answered is asked twice.
 
-    Args:
-        model: a folder, the name of a repository, or with engine `endpoint` a URL.
+    The model is a folder, the name of a repository, or with engine `endpoint` a URL.
 
     Returns:
         The path of `predictions.jsonl`: one line per sample, in the order of the split. A sample without an answer has

@@ -4,8 +4,7 @@ Needs neither captions nor torch.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
-from itertools import chain
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ from pydantic import Field
 from cosfly.formats.places import Place, flight_ids, place_of, sample_id
 from cosfly.formats.playback import ORIGINAL, Track
 from cosfly.formats.playback_file import read_track
+from cosfly.formats.predictions import Split
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.geometry.axes import step_s
 from cosfly.geometry.splits import SPLITS, Course, walks_of
@@ -38,12 +38,12 @@ Vector = tuple[float, float, float]
 class TrackSample(SplitMember):
     """One window: the perturbed track as observed, the clean poses of the same frames, and those of the next frames.
 
-    *_position_m, *_rotation_deg: x, y, z and pitch, yaw, roll of the camera. *_target_m: the target's hip, or None.
-    `window` holds the observed frames; `sample_id` is that of a caption of the same frames.
+    Positions are x, y, z and rotations pitch, yaw, roll of the camera; a target is the person's hip, or None. `window`
+    has the observed frames, and `sample_id` is that of a caption of the same frames.
     """
 
     future: tuple[int, ...]  # frames to predict
-    time_s: tuple[float, ...]  # of both
+    time_s: tuple[float, ...]  # of the observed frames and those to predict
     states: tuple[str | None, ...]  # of the observed frames: STATES of cosfly/formats/playback.py
     observed_position_m: tuple[Vector, ...]  # perturbed: the input of a model
     observed_rotation_deg: tuple[Vector, ...]
@@ -57,10 +57,20 @@ class TrackSample(SplitMember):
 
 
 class Pair(NamedTuple):
-    """The two tracks of one trajectory, of the same frames."""
+    """The two tracks of one trajectory, which have the same frames."""
 
     perturbed: Track
     clean: Track
+
+
+@dataclass(frozen=True)
+class PlacedPair:
+    """A pair with its names."""
+
+    place: Place
+    flight_id: str  # with which sample ids begin
+    walk: str
+    pair: Pair
 
 
 class DualTrackConfig(SplitConfig):
@@ -80,11 +90,7 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
     """Read playback trees; write windows by split into `out`, which is returned.
 
     A perturbed track of N frames with a clean one gives (N - length) // stride + 1 windows. Tracks that cannot be read
-    are failures and do not stop the others.
-
-    Raises:
-        NothingKept: no track gives a window.
-        InputError: two trees are of one run.
+    are failures and do not stop the others. NothingKept: no track gives a window. InputError: two trees are of one run.
     """
     check_names([run_of(tree) for tree in trees])
     runs = {run_of(tree): tree for tree in trees}
@@ -92,30 +98,40 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
     if stage.is_complete:
         return out
     folders = {place_of(folder, run): folder for run, tree in runs.items() for folder in find_tracks(tree)}
-    ids = flight_ids(folders)
     pairs, failures, tally = _read_pairs(folders, cfg)
     write_failures(out / "failures.jsonl", failures)
     if not pairs:
         raise stage.nothing_kept(tally, expected=f"a perturbed track of {cfg.length} frames with its clean track")
-    keys = {place: track_key(place) for place in pairs}
-    walks = walks_of(Course(keys[at], at.town, clean.time_s, clean.walked_m) for at, (_, clean) in pairs.items())
-    split_of = cfg.assigned(walks, walks, seed)
-    walk_of = {place: walks[key] for place, key in keys.items()}
-    places = {split: [place for place in pairs if split_of[keys[place]] == split] for split in SPLITS}
+    by_split = place_pairs(pairs, flight_ids(folders), cfg, seed)
     samples = {
-        split: chain.from_iterable(samples_of(place, ids[place], pairs[place], walk_of[place], cfg) for place in part)
-        for split, part in places.items()
+        split: (sample for placed in in_split for sample in samples_of(placed, cfg))
+        for split, in_split in by_split.items()
     }
     counts, paths = write_splits(out, TrackSample, samples)
     sources = [SourceTree(run=name, sha256=fingerprint(tree)) for name, tree in runs.items()]
     page = write_page(out, "Windows over two tracks", counts, sources, PAGE_TEXT.format(cfg=cfg))
     facts = {
-        split: {"samples": counts[split], "tracks": len(part), "walks": len({walk_of[place] for place in part})}
-        for split, part in places.items()
+        split: {"samples": counts[split], "tracks": len(in_split), "walks": len({placed.walk for placed in in_split})}
+        for split, in_split in by_split.items()
     }
-    num_uneven = sum(len(windows_of(len(pair.clean), cfg)) for pair in pairs.values()) - sum(counts.values())
-    stage.finish([*paths, page], tally, splits=facts, windows_left_out={"uneven_steps": num_uneven})
+    num_windows = sum(len(windows_of(len(pair.clean), cfg)) for pair in pairs.values())
+    uneven = {"uneven_steps": num_windows - sum(counts.values())}  # all that `samples_of` skips
+    stage.finish([*paths, page], tally, splits=facts, windows_left_out=uneven)
     return out
+
+
+def place_pairs(
+    pairs: Mapping[Place, Pair], ids: Mapping[Place, str], cfg: DualTrackConfig, seed: int
+) -> dict[Split, list[PlacedPair]]:
+    """Assign the pairs of each pedestrian trajectory, or town, to a split."""
+    courses = [Course(track_key(place), place.town, c.time_s, c.walked_m) for place, (_, c) in pairs.items()]
+    walks = walks_of(courses)
+    split_of = cfg.assigned(walks.keys(), walks, seed)
+    by_split: dict[Split, list[PlacedPair]] = {split: [] for split in SPLITS}
+    for place, pair in pairs.items():
+        key = track_key(place)
+        by_split[split_of[key]].append(PlacedPair(place, ids[place], walks[key], pair))
+    return by_split
 
 
 def _read_pairs(folders: Mapping[Place, Path], cfg: DualTrackConfig) -> tuple[dict[Place, Pair], list[Failed], Tally]:
@@ -156,25 +172,27 @@ def windows_of(num_frames: int, cfg: DualTrackConfig) -> range:
     return range(0, num_frames - cfg.length + 1, cfg.stride)
 
 
-def samples_of(place: Place, flight_id: str, pair: Pair, walk: str, cfg: DualTrackConfig) -> Iterator[TrackSample]:
+def samples_of(placed: PlacedPair, cfg: DualTrackConfig) -> Iterator[TrackSample]:
     """Cut a pair of tracks into windows, without those whose frames are not evenly apart in time."""
-    perturbed, clean = pair
+    perturbed, clean = placed.pair
     step = step_s(perturbed.time_s)
     for first in windows_of(len(perturbed), cfg):
-        now, end = first + cfg.observed, first + cfg.length  # where the observed and the predicted frames end
-        time_s = perturbed.time_s[first:end]
+        observed = range(first, first + cfg.observed)
+        future = range(observed.stop, first + cfg.length)
+        time_s = perturbed.time_s[first : future.stop]
         if len(time_s) > 1 and np.abs(np.diff(time_s) - step).max() > STEP_TOLERANCE_S:
             continue
-        seen, after = slice(first, now), slice(now, end)
         vectors: dict[str, Any] = {}
-        for part, track, rows in (("observed", perturbed, seen), ("clean", clean, seen), ("future", clean, after)):
+        parts = (("observed", perturbed, observed), ("clean", clean, observed), ("future", clean, future))
+        for part, track, frames in parts:
+            rows = slice(frames.start, frames.stop)
             vectors[f"{part}_position_m"] = _vectors(track.positions_m[rows])
             vectors[f"{part}_rotation_deg"] = _vectors(track.rotations_deg[rows])
             vectors[f"{part}_target_m"] = _vectors(track.targets_m[rows])
         yield TrackSample(
-            sample_id=sample_id(flight_id, now - 1), **asdict(place), walk=walk, window=tuple(range(first, now)),
-            future=tuple(range(now, end)), time_s=tuple(time_s.tolist()), states=tuple(perturbed.states[seen]),
-            **vectors,
+            sample_id=sample_id(placed.flight_id, observed[-1]), **asdict(placed.place), walk=placed.walk,
+            window=tuple(observed), future=tuple(future), time_s=tuple(time_s.tolist()),
+            states=tuple(perturbed.states[first : observed.stop]), **vectors,
         )  # fmt: skip
 
 

@@ -100,15 +100,12 @@ class SplitConfig(Config):
         return self
 
     def assigned(self, keys: Collection[str], walks: Mapping[str, str], seed: int) -> dict[str, Split]:
-        """Return the split of each track's key, `run/town/trajectory`: all keys of a walk, or of a town, share it.
-
-        With fewer walks (or towns) than splits, train is filled first, then val.
-
-        Args:
-            walks: key -> walk.
-        """
-        by_town = self.split_by == "town"
-        group_of = {key: town_family(key.split("/")[1]) if by_town else walks[key] for key in keys}
+        """Return the split of each track's key, `run/town/trajectory`: all keys of a walk (key -> walk), or of a town,
+        share it. With fewer walks (or towns) than splits, train is filled first, then val."""
+        if self.split_by == "town":
+            group_of = {key: town_family(key.split("/")[1]) for key in keys}
+        else:
+            group_of = {key: walks[key] for key in keys}
         fractions: dict[Split, float] = {"val": self.val_fraction, "test": self.test_fraction}
         split_of = assign_splits(group_of.values(), fractions, seed)
         return {key: split_of[group] for key, group in group_of.items()}
@@ -146,16 +143,13 @@ class PrepareConfig(SplitConfig):
 def make_sample(
     caption: Caption, language: Language, cfg: PrepareConfig, *, run: str = "", sample_id: str = ""
 ) -> Sample | str:
-    """Return the sample of a caption in one language, or the reason why there is none; its walk is not known yet.
-
-    Args:
-        run: of its track. sample_id: unique among the samples of all runs; "": that of the caption.
-    """
-    values = (caption.checks.values or {}).get(language)
+    """Return the sample of a caption in one language, or the reason why there is none; its walk is not known yet. The
+    id must be unique among the samples of all runs; "" takes that of the caption."""
     if caption.status != "accepted":
         return f"dropped_{caption.drop_reason or 'unknown'}"
     if caption.verdict not in cfg.verdicts:
         return f"verdict_{str(caption.verdict).lower()}"
+    values = (caption.checks.values or {}).get(language)
     if values is not None and values.values_contradicted:
         return "contradicted"
     coc = caption.en if language == "en" else caption.zh
@@ -166,7 +160,7 @@ def make_sample(
     if parsed.coc is None:  # the evaluation would call it wrong
         return f"answer_{parsed.reason}"
     pictures = Pictures(cfg.modalities, caption.picture_px, depth_range_m=caption.depth_range_m or DEPTH_RANGE_M)
-    is_noisy = caption.label_from == "perturbed"  # and so are the decisions that this future rules out
+    is_noisy = caption.label_from == "perturbed"  # the label, and the decisions that are ruled out
     ruled_out = caption.checks.contradicted
     return Sample(
         **{name: getattr(caption, name) for name in ("town", "trajectory", "variant")},
@@ -185,15 +179,18 @@ def track_key(of: TrackPlace | Sample) -> str:
 
 
 class _Tracks:
-    """The tracks of all sources. courses: of those that were read."""
+    """The tracks of all sources."""
 
     def __init__(self, cfg: PrepareConfig, sources: Sequence[RunSource]) -> None:
-        self._cfg, self._sources = cfg, sources
-        self._frames: dict[Path, frozenset[int]] = {}  # of a track: those that have all files of the views
-        self.courses: list[Course] = []
+        self._cfg = cfg
+        self._sources = sources
+        self._frames: dict[Path, frozenset[int]] = {}  # of each track: those that have all files of the views
+        self.courses: list[Course] = []  # of the pedestrians of the tracks that were read
         self._read = lru_cache(maxsize=4)(lambda folder: read_track(folder))
-        trees = [(source.run, source.data) for source in sources] if len(sources) > 1 else []
-        self._ids = flight_ids([track_place(folder, run) for run, tree in trees for folder in find_tracks(tree)])
+        self._ids: dict[TrackPlace, str] = {}  # begin of the sample ids; empty for one source, which keeps its ids
+        if len(sources) > 1:
+            places = [track_place(folder, source.run) for source in sources for folder in find_tracks(source.data)]
+            self._ids = flight_ids(places)
 
     def windows(self) -> Iterator[list[Sample | str]]:
         """Yield the samples of each caption, one per language, with a reason in place of a missing one."""
@@ -225,24 +222,20 @@ class _Tracks:
         """Return the frames of a track that have all files of the views, and note its course."""
         if not (folder / "trajectory.json").exists():
             return frozenset()
-        track, files = self._read(folder), [VIEW_FILES[view] for view in self._cfg.modalities]
+        track = self._read(folder)
         self.courses.append(Course(track_key(place), place.town, track.time_s, track.walked_m).at_seconds())
-        frames = [folder / frame_name(index) for index in range(len(track))]
-        return frozenset(i for i, frame in enumerate(frames) if all(frame_path(frame, f).is_file() for f in files))
+        names = [VIEW_FILES[view] for view in self._cfg.modalities]
+        return frozenset(
+            i for i in range(len(track)) if all(frame_path(folder / frame_name(i), name).is_file() for name in names)
+        )
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
 def run(cfg: PrepareConfig, sources: Sequence[RunSource], out: Path, *, seed: int = 0) -> Path:
-    """Read the captions and playback trees of some runs; write a training set (distill/schema.py) into `out`.
-
-    Returns:
-        `out`.
-
-    Raises:
-        NothingKept: no caption can be used. VerifyError: captions are of another tree.
-    """
+    """Read the captions and playback trees of some runs; write a training set (distill/schema.py) into `out`, which is
+    returned. NothingKept: no caption can be used. VerifyError: captions are of another tree."""
     inputs = tree_inputs([source.data for source in sources], [source.captions for source in sources])
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed)
     if stage.is_complete:
@@ -252,52 +245,66 @@ def run(cfg: PrepareConfig, sources: Sequence[RunSource], out: Path, *, seed: in
         record = record_of(source.captions)
         if record is None or "data" not in record.inputs:
             log.warning("%s: no record tells that these are captions of %s", source.captions, source.data)
-    tracks, windows, left_out = _Tracks(cfg, sources), dict[str, list[Sample]](), Counter[str]()
-    with progress_bar(f"{STAGE}: reading", total=None) as advance:
-        for found in tracks.windows():
-            advance(1)
-            left_out.update(reason for reason in found if isinstance(reason, str))
-            own = [sample for sample in found if isinstance(sample, Sample)]
-            if own and windows.setdefault(own[0].sample_id, own) is not own:
-                fix = "remove one of the two lines"
-                raise InputError("the captions have two lines for this window", where=own[0].sample_id, fix=fix)
+    tracks = _Tracks(cfg, sources)
+    windows, dropped = _read_windows(tracks)
     if not windows:
-        tally = Tally(input=left_out.total(), dropped=left_out)
+        tally = Tally(input=dropped.total(), dropped=dropped)
         raise stage.nothing_kept(tally, expected="accepted captions with images below --data")
     walks = walks_of(tracks.courses)
-    split_of = cfg.assigned({track_key(own[0]) for own in windows.values()}, walks, seed)
-    # At random, and independent of the other windows.
+    split_of = cfg.assigned({track_key(of_window[0]) for of_window in windows.values()}, walks, seed)
+    # Windows are chosen by a hash, so that a choice does not depend on the other windows.
     ranked = sorted(windows, key=lambda name: hashlib.sha256(f"{seed}/{STAGE}/{name}".encode()).digest())
     chosen = set(ranked[: cfg.limit or None])
     samples: dict[Split, list[Sample]] = {split: [] for split in SPLITS}
-    for name, own in windows.items():
-        key = track_key(own[0])
+    for name, of_window in windows.items():
+        key = track_key(of_window[0])
         if name in chosen:
-            samples[split_of[key]] += [sample.model_copy(update={"walk": walks[key]}) for sample in own]
+            samples[split_of[key]] += [sample.model_copy(update={"walk": walks[key]}) for sample in of_window]
         else:
-            left_out["limit"] += len(own)
+            dropped["limit"] += len(of_window)
     counts, paths = write_splits(out, Sample, samples)
-    pictured = sources if cfg.modalities else []
-    trees = [SourceTree(run=source.run, sha256=fingerprint(source.data)) for source in pictured]
+    trees: list[SourceTree] = []
+    if cfg.modalities:
+        trees = [SourceTree(run=source.run, sha256=fingerprint(source.data)) for source in sources]
     write_model(out / RECORD, TrainingSet(split_by=cfg.split_by, trees=trees, samples=counts), RECORD_FORMAT)
     page = write_page(out, "Training set", counts, trees, PAGE_TEXT.format(cfg.split_by))
     num_kept = sum(counts.values())
-    tally = Tally(input=num_kept + left_out.total(), kept=num_kept, dropped=left_out)
+    tally = Tally(input=num_kept + dropped.total(), kept=num_kept, dropped=dropped)
     stage.finish([*paths, out / RECORD, page], tally, splits=_facts(samples), split_by=cfg.split_by)
     return out
+
+
+def _read_windows(tracks: _Tracks) -> tuple[dict[str, list[Sample]], Counter[str]]:
+    """Return the samples of each window by their id, and why how many are dropped."""
+    windows = dict[str, list[Sample]]()
+    dropped = Counter[str]()
+    with progress_bar(f"{STAGE}: reading", total=None) as advance:
+        for results in tracks.windows():
+            advance(1)
+            dropped.update(reason for reason in results if isinstance(reason, str))
+            samples = [sample for sample in results if isinstance(sample, Sample)]
+            if not samples:
+                continue
+            name = samples[0].sample_id
+            if name in windows:
+                fix = "remove one of the two lines"
+                raise InputError("the captions have two lines for this window", where=name, fix=fix)
+            windows[name] = samples
+    return windows, dropped
 
 
 def _facts(samples: Mapping[Split, Sequence[Sample]]) -> dict[str, dict[str, Any]]:
     """Return the counts of the manifest; warn of empty splits and of decisions that training does not have."""
     facts: dict[str, dict[str, Any]] = {}
-    known = {sample.decision for sample in samples["train"]}
-    for split, own in samples.items():
-        decisions = dict(sorted(Counter(sample.decision for sample in own).items()))
-        if not own:
+    in_train = {sample.decision for sample in samples["train"]}
+    for split, in_split in samples.items():
+        decisions = dict(sorted(Counter(sample.decision for sample in in_split).items()))
+        if not in_split:
             log.warning("%s: the split %s is empty", STAGE, split)
-        if unseen := {name: count for name, count in decisions.items() if name not in known}:
-            log.warning("%s: %s has decisions that train does not have: %s", STAGE, split, unseen)
-        tracks = {(sample.run, sample.town, sample.trajectory, sample.variant) for sample in own}
-        counts = {"samples": len(own), "walks": len({sample.walk for sample in own}), "tracks": len(tracks)}
-        facts[split] = {**counts, "by_decision": decisions, "not_in_train": unseen}
+        if not_in_train := {name: count for name, count in decisions.items() if name not in in_train}:
+            log.warning("%s: %s has decisions that train does not have: %s", STAGE, split, not_in_train)
+        walks = {sample.walk for sample in in_split}
+        tracks = {(sample.run, sample.town, sample.trajectory, sample.variant) for sample in in_split}
+        counts = {"samples": len(in_split), "walks": len(walks), "tracks": len(tracks)}
+        facts[split] = {**counts, "by_decision": decisions, "not_in_train": not_in_train}
     return facts

@@ -26,16 +26,12 @@ MARKUP = re.compile(r"[<\[|].+[>\]|]")  # tokens such as <think>, [INST], <|im_e
 
 @dataclass(frozen=True)
 class EncodedSample:
-    """The tokens of a sample.
+    """The tokens of a sample."""
 
-    prompt_ids (n,), answer_ids (m,) int32, the end token included in the answer. weights (m,) float32: in the loss.
-    kinds (n,) int8: which tokens of the prompt are pictures, for families that want to know; 0 for others.
-    """
-
-    prompt_ids: np.ndarray
-    answer_ids: np.ndarray
-    weights: np.ndarray
-    kinds: np.ndarray
+    prompt_ids: np.ndarray  # (n,) int32
+    answer_ids: np.ndarray  # (m,) int32, with the end token
+    weights: np.ndarray  # (m,) float32, of the answer's tokens in the loss
+    kinds: np.ndarray  # (n,) int8, which tokens of the prompt are pictures; 0 for families that take no kinds
 
     def __len__(self) -> int:
         return len(self.prompt_ids) + len(self.answer_ids)
@@ -46,23 +42,24 @@ class EncodedSample:
 
 
 class _BySize:
-    """An image processor that processes one blank picture per (number, size) and remembers the result.
+    """An image processor that processes blank pictures of the same number and sizes once, and remembers the result.
 
-    How many tokens a picture takes depends on its size alone, so prompts can be written before pictures are read.
+    How many tokens a picture takes depends only on its size, so prompts can be written before pictures are read.
     """
 
-    def __init__(self, images: Any) -> None:
-        self.images, self._known = images, dict[Any, Any]()
+    def __init__(self, image_processor: Any) -> None:
+        self.image_processor = image_processor
+        self._results: dict[Any, Any] = {}
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self.images, name)
+        return getattr(self.image_processor, name)
 
     def __call__(self, images: Any, **settings: Any) -> Any:
-        flat = [image for entry in images for image in (entry if isinstance(entry, list) else [entry])]
-        key = tuple(image.size for image in flat), tuple(len(e) if isinstance(e, list) else 0 for e in images)
-        if key not in self._known:
-            self._known[key] = self.images(images, **settings)
-        return type(self._known[key])(dict(self._known[key]))
+        # The sizes as the pictures are nested: one alone, or a list of them for each text.
+        key = tuple(tuple(p.size for p in entry) if isinstance(entry, list) else entry.size for entry in images)
+        if key not in self._results:
+            self._results[key] = self.image_processor(images, **settings)
+        return type(self._results[key])(dict(self._results[key]))
 
     def fetch_images(self, images: Any) -> Any:
         return images
@@ -70,15 +67,11 @@ class _BySize:
 
 @dataclass
 class Processor:
-    """Turns texts and pictures into tensors; it has no model, so worker processes can hold it.
-
-    library: transformers' processor of a family with pictures; None: a text-only student. template: chat template
-    that replaces the student's own; empty: none.
-    """
+    """Turns texts and pictures into tensors; it has no model, so worker processes can hold it."""
 
     tokenizer: Any
-    library: Any
-    template: str = ""
+    library: Any  # transformers' processor of a family with pictures; None for a text-only student
+    template: str = ""  # chat template that replaces the student's own; empty: none
 
     @property
     def has_pictures(self) -> bool:
@@ -105,22 +98,24 @@ class Processor:
 
     @cached_property
     def end_token_id(self) -> int:
-        """The token that ends an answer: the first that the template writes after one, or the tokenizer's own."""
-        tokens, (_, after) = self.tokenizer.added_tokens_decoder, self._around_answer
-        ends = [i for i, t in tokens.items() if t.special and after.startswith(t.content)]
-        own = self.tokenizer.eos_token_id
-        return int(ends[0]) if ends else -1 if own is None else int(own)
+        """The first token that the template writes after an answer, or the tokenizer's own end token, or -1."""
+        _, after = self._around_answer
+        for token_id, token in self.tokenizer.added_tokens_decoder.items():
+            if token.special and after.startswith(token.content):
+                return int(token_id)
+        return -1 if self.tokenizer.eos_token_id is None else int(self.tokenizer.eos_token_id)
 
     @property
     def end_of_answer(self) -> str:
-        """What is taught after an answer, and the rest of what the chat template writes after this token."""
-        end, (_, after) = self.tokenizer.decode([self.end_token_id]), self._around_answer
+        """The end token, and the rest of what the chat template writes after it."""
+        _, after = self._around_answer
+        end = self.tokenizer.decode([self.end_token_id])
         return after if after.startswith(end) else end
 
     @property
     def pad_token_id(self) -> int:
-        found = self.tokenizer.pad_token_id
-        return self.end_token_id if found is None else int(found)
+        pad = self.tokenizer.pad_token_id
+        return self.end_token_id if pad is None else int(pad)
 
     @cached_property
     def chat_tokens(self) -> tuple[str, ...]:
@@ -176,22 +171,17 @@ class Processor:
         return self._sized(text=[text], images=[[blank] * count], add_special_tokens=False)
 
     def encode(self, sample: Sample, max_pixels: int = 0, decision_weight: float = 1.0) -> EncodedSample:
-        """Return the tokens of a sample.
-
-        Args:
-            max_pixels: limit of a picture, as in `limited_size`; 0: none.
-            decision_weight: of the tokens of the decision in the loss; others have 1.
-        """
+        """Return the tokens of a sample; `decision_weight` is that of the decision in the loss, others have 1."""
         size_px = limited_size(sample.picture_px, max_pixels)
         try:
-            found = self._tokens(self.prompt_text(sample), size_px, len(sample.images))
+            prompt = self._tokens(self.prompt_text(sample), size_px, len(sample.images))
         except ValueError as error:
             fix = "remove special tokens for pictures from the text of the prompt"
             raise InputError("the prompt cannot be encoded", where=sample.key, got=str(error)[:200], fix=fix) from error
         text = self.lead + sample.answer
         answer = self.tokenizer(text, add_special_tokens=False, return_offsets_mapping=self.tokenizer.is_fast)
-        ids = np.array(found["input_ids"][0], dtype=np.int32)
-        kinds = found.get(self.kinds_name) if sample.images else None
+        ids = np.array(prompt["input_ids"][0], dtype=np.int32)
+        kinds = prompt.get(self.kinds_name) if sample.images else None
         return EncodedSample(
             prompt_ids=ids,
             answer_ids=np.array([*answer["input_ids"], self.end_token_id], dtype=np.int32),
@@ -204,37 +194,33 @@ class Processor:
         """The name under which the model takes `kinds`; empty: it takes none."""
         if not self.has_pictures:
             return ""
-        found = self._tokens(self._picture_text, (64, 64), 1)
-        return next((name for name in found if name.endswith("token_type_ids")), "")
+        inputs = self._tokens(self._picture_text, (64, 64), 1)
+        return next((name for name in inputs if name.endswith("token_type_ids")), "")
 
     @cached_property
     def _picture_text(self) -> str:
         return self._render([{"role": "user", "content": [IMAGE_PART, {"type": "text", "text": "x"}]}])
 
     def picture_inputs(self, picture: np.ndarray, *, is_alone: bool) -> dict[str, np.ndarray]:
-        """Return a picture, (h, w, 3) uint8, as the inputs that the model takes of it.
-
-        Args:
-            is_alone: it is the only picture of its sample. LLaVA-OneVision cuts such a picture into tiles.
-        """
+        """Return a picture, (h, w, 3) uint8, as the inputs that the model takes of it."""
         image = Image.fromarray(picture)
-        found: dict[str, Any] = dict(self.library(text=[self._picture_text], images=[[image]], return_tensors="np"))
-        if "batch_num_images" in found and not is_alone:
+        inputs: dict[str, Any] = dict(self.library(text=[self._picture_text], images=[[image]], return_tensors="np"))
+        if "batch_num_images" in inputs and not is_alone:  # LLaVA-OneVision cuts the only picture of a text into tiles
             twice = self.library(text=[self._picture_text * 2], images=[[image, image]], return_tensors="np")
-            found = {name: value[:1] for name, value in twice.items()}
+            inputs = {name: value[:1] for name, value in twice.items()}
         of_text = ("input_ids", "attention_mask", self.kinds_name)
-        return {name: np.asarray(value) for name, value in found.items() if name not in of_text}
+        return {name: np.asarray(value) for name, value in inputs.items() if name not in of_text}
 
 
 def _token_weights(text: str, tokens: Mapping[str, Any], decision_weight: float) -> np.ndarray:
-    """Return the weight of each token of an answer and of its end token, (m,) float32."""
-    found = np.ones(len(tokens["input_ids"]) + 1, dtype=np.float32)
+    """Return the weights of an answer's tokens and end token, (m,) float32: 1, or that of the decision."""
+    weights = np.ones(len(tokens["input_ids"]) + 1, dtype=np.float32)
     key = re.search(rf'"{FIELDS[-1]}"\s*:\s*"', text)
     if key is not None and "offset_mapping" in tokens:
         _, end = json.JSONDecoder().raw_decode(text, key.end() - 1)  # behind the closing quotation mark
         begins, ends = np.array(tokens["offset_mapping"]).reshape(-1, 2).T
-        found[:-1][(ends > key.end()) & (begins < end - 1)] = decision_weight
-    return found
+        weights[:-1][(ends > key.end()) & (begins < end - 1)] = decision_weight
+    return weights
 
 
 def special_token_in(processor: Processor, sample: Sample) -> str | None:
@@ -245,11 +231,13 @@ def special_token_in(processor: Processor, sample: Sample) -> str | None:
 
 def check_template(processor: Processor, sample: Sample) -> None:
     """Check that prompt, answer and end are, character by character, what the chat template writes for the chat."""
-    whole = processor.chat_text(sample)
+    written = processor.chat_text(sample)
     taught = processor.prompt_text(sample) + processor.lead + sample.answer + processor.end_of_answer
-    if taught != whole:
-        at = next((i for i, pair in enumerate(zip(taught, whole, strict=False)) if len(set(pair)) > 1), len(taught))
-        expected, got = (f"{text[at : at + 40]!r} at character {at}" for text in (taught, whole))
+    if taught != written:
+        differs = (i for i, (a, b) in enumerate(zip(taught, written, strict=False)) if a != b)
+        at = next(differs, min(len(taught), len(written)))
+        expected = f"{taught[at : at + 40]!r} at character {at}"
+        got = f"{written[at : at + 40]!r} at character {at}"
         words = "the chat template does not write the text that the student is trained on"
         raise InputError(words, where="student", got=got, expected=expected, fix="correct the chat template")
 
@@ -262,9 +250,9 @@ def padded(processor: Processor, rows: Sequence[EncodedSample]) -> dict[str, np.
     ids = _stacked([np.append(row.prompt_ids, row.answer_ids) for row in rows], processor.pad_token_id)
     labels = [np.append(np.full_like(row.prompt_ids, IGNORED), row.answer_ids) for row in rows]
     weights = [np.append(np.zeros(len(row.prompt_ids), np.float32), row.weights) for row in rows]
-    found = {"input_ids": ids, "labels": _stacked(labels, IGNORED), "weights": _stacked(weights, 0)}
-    kinds = [np.append(row.kinds, np.zeros_like(row.answer_ids)) for row in rows]
-    return found | ({processor.kinds_name: _stacked(kinds, 0)} if any(map(np.any, kinds)) else {})
+    batch = {"input_ids": ids, "labels": _stacked(labels, IGNORED), "weights": _stacked(weights, 0)}
+    kinds = _stacked([np.append(row.kinds, np.zeros_like(row.answer_ids)) for row in rows], 0)
+    return batch | ({processor.kinds_name: kinds} if kinds.any() else {})
 
 
 def prompt_batch(processor: Processor, rows: Sequence[EncodedSample]) -> dict[str, np.ndarray]:
@@ -272,13 +260,15 @@ def prompt_batch(processor: Processor, rows: Sequence[EncodedSample]) -> dict[st
     ids = _stacked([row.prompt_ids for row in rows], processor.pad_token_id, is_left=True)
     mask = _stacked([np.ones_like(row.prompt_ids) for row in rows], 0, is_left=True)
     kinds = _stacked([row.kinds for row in rows], 0, is_left=True)
-    found = {"input_ids": ids, "attention_mask": mask}
-    return found | ({processor.kinds_name: kinds} if kinds.any() else {})
+    batch = {"input_ids": ids, "attention_mask": mask}
+    return batch | ({processor.kinds_name: kinds} if kinds.any() else {})
 
 
 def _stacked(rows: Sequence[np.ndarray], fill: int, *, is_left: bool = False) -> np.ndarray:
-    """Pad rows to the longest one; whole numbers become int64, as PyTorch wants them."""
-    counts = [max(map(len, rows)) - len(row) for row in rows]
-    pads = [(count, 0) if is_left else (0, count) for count in counts]
-    found = np.stack([np.pad(row, pad, constant_values=fill) for row, pad in zip(rows, pads, strict=True)])
-    return found if found.dtype == np.float32 else found.astype(np.int64)
+    """Pad rows to the longest one, on the right or the left; whole numbers become int64, as PyTorch needs them."""
+    dtype = np.float32 if rows[0].dtype == np.float32 else np.int64
+    stacked = np.full((len(rows), max(map(len, rows))), fill, dtype)
+    for i, row in enumerate(rows):
+        start = stacked.shape[1] - len(row) if is_left else 0
+        stacked[i, start : start + len(row)] = row
+    return stacked

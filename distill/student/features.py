@@ -62,8 +62,7 @@ class PictureReader:
     max_pixels: int = 0  # limit of a picture; 0: none
 
     def read(self, picture: FramePicture) -> Tensors:
-        """Read the inputs of a picture; InputError if its file is missing, damaged, or of another size than the prompt
-        says."""
+        """Read the inputs of a picture; InputError if its file is missing, damaged or of an unexpected size."""
         import torch
 
         (pixels,) = picture.view.read(inside(self.trees[picture.run], picture.frame))

@@ -50,13 +50,12 @@ def quiet_transformers() -> None:
 
 @dataclass(kw_only=True)
 class Student(Processor):
-    """A loaded student. `model` is a transformers model or a peft model around it; `dtype` is the type of the
-    computation, while weights that are trained may be kept in float32; `stored` is their type on disk, if known."""
+    """A loaded student."""
 
-    model: Any
+    model: Any  # a transformers model, or a peft model around it
     device: str
-    dtype: Any
-    stored: Any = None
+    dtype: Any  # of the computation; weights that are trained may be kept in float32
+    stored: Any = None  # type of the weights on disk, if known
 
     @property
     def core(self) -> Any:
@@ -81,12 +80,8 @@ def is_hub_name(name: str) -> bool:
 
 
 def student_path(name: str, *, allow_code: bool = False) -> Path:
-    """Return the folder or the GGUF file of a student.
-
-    Args:
-        name: a folder, a GGUF file, or a repository, such as `Qwen/Qwen3.5-2B`, to download into the hub's cache.
-        allow_code: download the code of the repository too.
-    """
+    """Return the folder or the GGUF file of a student. A repository, such as `Qwen/Qwen3.5-2B`, is downloaded into the
+    hub's cache, with its code if `allow_code`."""
     if not is_hub_name(name):
         return Path(name)
     require("torch", "transformers", "peft")
@@ -119,9 +114,12 @@ def pick_device(wanted: Device) -> str:
     """Return the device to use: `cuda` if there is one, unless the settings say otherwise."""
     import torch
 
-    if wanted == "cuda" and not torch.cuda.is_available():
+    has_cuda = torch.cuda.is_available()
+    if wanted == "cuda" and not has_cuda:
         raise EnvironmentMissing("torch finds no accelerator", got="device=cuda", fix="set device=auto or device=cpu")
-    return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted
+    if wanted == "auto":
+        return "cuda" if has_cuda else "cpu"
+    return wanted
 
 
 def compute_dtype(wanted: Dtype, device: str) -> Any:
@@ -160,23 +158,23 @@ def _picture_processor(config: Any, tokenizer: Any, arguments: dict[str, Any]) -
 
     folder = arguments["pretrained_model_name_or_path"]
     images = AutoImageProcessor.from_pretrained(**arguments, backend="pil")
-    own: dict[str, Any] = {}
+    recorded: dict[str, Any] = {}
     if (folder / "processor_config.json").is_file():
-        own = read_object(folder / "processor_config.json", what="processor")
-    name = own.get("processor_class") or processing_auto.PROCESSOR_MAPPING_NAMES.get(config.model_type)
+        recorded = read_object(folder / "processor_config.json", what="processor")
+    name = recorded.get("processor_class") or processing_auto.PROCESSOR_MAPPING_NAMES.get(config.model_type)
     if name is None:
         raise ValueError(f"transformers has no processor for model_type {config.model_type!r}")
     base: Any = processing_auto.processor_class_from_name(name)
-    used = [part for part in base.get_attributes() if part in ("image_processor", "tokenizer")]
+    parts = [part for part in base.get_attributes() if part in ("image_processor", "tokenizer")]
 
     class PictureProcessor(base):
         @classmethod
         def get_attributes(cls) -> list[str]:
-            return used
+            return parts
 
-    known = inspect.signature(base.__init__).parameters
-    settings = {key: value for key, value in own.items() if key in known and "processor" not in key}
-    if "video_processor" in known:
+    parameters = inspect.signature(base.__init__).parameters
+    settings = {key: value for key, value in recorded.items() if key in parameters and "processor" not in key}
+    if "video_processor" in parameters:
         settings["video_processor"] = None
     if (file := folder / "chat_template.json").is_file():
         settings.setdefault("chat_template", read_object(file, what="chat template").get("chat_template"))
@@ -185,15 +183,10 @@ def _picture_processor(config: Any, tokenizer: Any, arguments: dict[str, Any]) -
 
 
 def load_student(
-    path: Path,
-    *,
-    device: Device = "auto",
-    dtype: Dtype = "auto",
-    adapter: Path | None = None,
-    is_trained: bool = False,
-    template: str = "",
-    allow_code: bool = False,
-) -> Student:
+    path: Path, *,
+    device: Device = "auto", dtype: Dtype = "auto", adapter: Path | None = None, is_trained: bool = False,
+    template: str = "", allow_code: bool = False,
+) -> Student:  # fmt: skip
     """Load a student, with an adapter if one is given.
 
     Args:
@@ -206,7 +199,6 @@ def load_student(
     weight_files(path)
     log.info("loading the student %s%s", path, ", a GGUF file: this may take minutes" * (path.suffix == GGUF))
     import torch
-    from peft import PeftModel, load_peft_weights
     from transformers import AutoConfig, AutoModelForCausalLM, AutoModelForImageTextToText, AutoTokenizer
     from transformers.models.auto.modeling_auto import MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING
 
@@ -220,42 +212,52 @@ def load_student(
     with loading_errors("configuration of the student", path):
         config = AutoConfig.from_pretrained(**arguments)
     stored = None if path.suffix == GGUF else getattr(config, "dtype", None)
-    own = getattr(config, "auto_map", None) or {}
-    sees = type(config) in MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING or "AutoModelForImageTextToText" in own
+    own_code = getattr(config, "auto_map", None) or {}
+    takes_pictures = type(config) in MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING or "AutoModelForImageTextToText" in own_code
     with loading_errors("tokenizer of the student", path):
         tokenizer: Any = AutoTokenizer.from_pretrained(**arguments)
     library = None
-    if sees and hasattr(config, "vision_config"):
+    if takes_pictures and hasattr(config, "vision_config"):
         with loading_errors("processor of the student", path):
             library = _picture_processor(config, tokenizer, arguments)
     if not template and adapter is not None and (adapter / TEMPLATE).is_file():
         template = read_text(adapter / TEMPLATE, what="chat template")
     Processor(tokenizer, library, template).check(path)
-    is_fast = config.model_type == "qwen3_5"  # a family with faster code of ours
-    if is_fast:
+    is_qwen3_5 = config.model_type == "qwen3_5"  # for which we have faster code
+    if is_qwen3_5:
         qwen3_5.choose_kernels(computed, device_name)
-    auto_class: Any = AutoModelForImageTextToText if sees else AutoModelForCausalLM
-    dtypes: Any = {"config": config, "dtype": torch.float32 if is_trained else computed, "use_safetensors": True}
+    auto_class: Any = AutoModelForImageTextToText if takes_pictures else AutoModelForCausalLM
+    weights_dtype = torch.float32 if is_trained else computed
     with loading_errors("student", adapter or path):
-        model, info = auto_class.from_pretrained(**arguments, **dtypes, output_loading_info=True)
-        if missing := sorted(info["missing_keys"]):  # the library would draw them at random
+        model, info = auto_class.from_pretrained(
+            **arguments, config=config, dtype=weights_dtype, use_safetensors=True, output_loading_info=True
+        )
+        if missing := sorted(info["missing_keys"]):  # the library would fill them with random numbers
             got, fix = f"no {', '.join(missing[:3])} ({len(missing)} missing)", "download the whole model"
             raise InputError("the student has no weights for some of its layers", where=path, got=got, fix=fix)
         if path.suffix == GGUF:  # the weights are plain numbers now, which can be saved
             model.config.__dict__.pop("quantization_config", None)
             model.__dict__.pop("hf_quantizer", None)
         if adapter is not None:
-            if not (adapter / "adapter_model.safetensors").is_file():
-                raise InputError("the folder is not an adapter", where=adapter, expected="adapter_model.safetensors")
-            model = PeftModel.from_pretrained(model, adapter)
-            num_found = len(load_peft_weights(str(adapter), device="cpu"))
-            num_wanted = sum("lora_" in name for name, _ in model.named_parameters())
-            if num_found != num_wanted:  # the library leaves a missing tensor at zero, and ignores one too many
-                got, fix = f"{num_found} tensors", "pass the base model of this adapter, or the whole adapter"
-                words, expected = "the adapter does not fit the model", f"{num_wanted} tensors"
-                raise InputError(words, where=adapter, got=got, expected=expected, fix=fix)
+            model = _with_adapter(model, adapter)
     model.to(device_name)
-    if is_fast and device_name == "cuda":
+    if is_qwen3_5 and device_name == "cuda":
         qwen3_5.fuse_norms(model)
     log.info("the student is loaded")
     return Student(tokenizer, library, template, model=model, device=device_name, dtype=computed, stored=stored)
+
+
+def _with_adapter(model: Any, adapter: Path) -> Any:
+    """Return a model with an adapter, all of whose tensors must fit: the library leaves a missing one at zero."""
+    from peft import PeftModel, load_peft_weights
+
+    if not (adapter / "adapter_model.safetensors").is_file():
+        raise InputError("the folder is not an adapter", where=adapter, expected="adapter_model.safetensors")
+    model = PeftModel.from_pretrained(model, adapter)
+    num_tensors = len(load_peft_weights(str(adapter), device="cpu"))
+    num_expected = sum("lora_" in name for name, _ in model.named_parameters())
+    if num_tensors != num_expected:
+        got, fix = f"{num_tensors} tensors", "pass the base model of this adapter, or the whole adapter"
+        words, expected = "the adapter does not fit the model", f"{num_expected} tensors"
+        raise InputError(words, where=adapter, got=got, expected=expected, fix=fix)
+    return model

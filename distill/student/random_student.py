@@ -15,6 +15,7 @@ from distill.student.model import quiet_transformers, require
 from distill.student.saving import writing_errors
 
 TINY, RANDOM = "tiny", "random"  # values of `--student`, as folders and names of repositories are
+LEAST_VOCABULARY = 800  # tokens
 START, END_OF_TURN, PAD = "<|im_start|>", "<|im_end|>", "<|endoftext|>"
 VISION_START, VISION_END, IMAGE, VIDEO = "<|vision_start|>", "<|vision_end|>", "<|image_pad|>", "<|video_pad|>"
 _CHAT_TEMPLATE = (
@@ -50,11 +51,8 @@ TINY_STUDENT = RandomStudent()  # overfits a handful of captions within minutes 
 def make_random_student(
     folder: Path, cfg: RandomStudent = TINY_STUDENT, seed: int = 0, texts: Iterable[str] = ()
 ) -> Path:
-    """Write a randomly initialised student as a model folder.
-
-    Args:
-        texts: what its byte-level tokenizer is trained on, besides a few lines of our own.
-    """
+    """Write a randomly initialised student as a model folder. Its byte-level tokenizer is trained on the texts, besides
+    a few lines of our own."""
     require("torch", "transformers")
     import torch
     from transformers import Qwen3_5ForConditionalGeneration
@@ -63,8 +61,8 @@ def make_random_student(
 
     quiet_transformers()
     empty: Any = {"vocab": {}, "merges": [], "eos_token": END_OF_TURN, "pad_token": PAD, "model_max_length": 32768}
-    lines = (*_TOKENIZER_TEXT, *texts)
-    tokenizer = Qwen3_5Tokenizer(**empty).train_new_from_iterator(lines, max(800, 8 * cfg.width), show_progress=False)
+    lines, size = (*_TOKENIZER_TEXT, *texts), max(LEAST_VOCABULARY, 8 * cfg.width)
+    tokenizer = Qwen3_5Tokenizer(**empty).train_new_from_iterator(lines, size, show_progress=False)
     tokenizer.add_special_tokens({"extra_special_tokens": [START, VISION_START, VISION_END, IMAGE, VIDEO]})
     tokenizer.chat_template = _CHAT_TEMPLATE
     sizes: Any = {"patch_size": 16, "merge_size": 2, "temporal_patch_size": 2}

@@ -33,10 +33,10 @@ def writing_errors(path: Path) -> Iterator[None]:
         try:
             yield
         except Exception as error:  # safetensors and tokenizers give the number of the system's error in their text
-            found = re.search(r"os error (\d+)", str(error))
-            if found is None:
+            match = re.search(r"os error (\d+)", str(error))
+            if match is None:
                 raise
-            raise OSError(int(found[1]), os.strerror(int(found[1])), str(path)) from error
+            raise OSError(int(match[1]), os.strerror(int(match[1])), str(path)) from error
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Any]) -> None:
@@ -57,13 +57,13 @@ def write_student(student: Student, folder: Path, base: Path, base_name: str = "
     adapters = getattr(student.model, "peft_config", {})
     for config in adapters.values():
         config.base_model_name_or_path = base_name
-    files = {path for pattern in COPIED for path in base.glob(pattern)} if base.is_dir() and not adapters else set()
-    for path in sorted(files):
-        if path.is_file() and "safetensors" not in path.name:
-            shutil.copyfile(path, folder / path.name)  # the content, because a hub's cache has links
-    more = {"save_embedding_layers": False} if adapters else {}  # peft would look for the base on the hub
+    if base.is_dir() and not adapters:
+        for path in sorted({path for pattern in COPIED for path in base.glob(pattern)}):
+            if path.is_file() and "safetensors" not in path.name:
+                shutil.copyfile(path, folder / path.name)  # the content, because a hub's cache has links
+    options = {"save_embedding_layers": False} if adapters else {}  # peft would look for the base on the hub
     with writing_errors(folder):
-        student.model.save_pretrained(folder, **more)
+        student.model.save_pretrained(folder, **options)
         if not base.is_dir() and not adapters:
             student.tokenizer.save_pretrained(folder)
     if student.template:
@@ -86,8 +86,8 @@ def check_adapter(adapter: Path, model: Path) -> dict[str, Path]:
         expected = f"{ADAPTER_FACTS} and {CHAT_FORMAT_FILE} of a finished cosfly distill train"
         fix = "pass the folder adapter/ of a training; the folder model/ of a training is a whole model"
         raise InputError("the folder is not an adapter", where=adapter, expected=expected, fix=fix)
-    wanted, found = read_model(path, AdapterFacts, ADAPTER_FORMAT).base_sha256, base_digests(model)
-    if wanted != found:
-        got, expected, fix = str(found)[:120], str(wanted)[:120], "pass the base model of this adapter"
+    recorded, digests = read_model(path, AdapterFacts, ADAPTER_FORMAT).base_sha256, base_digests(model)
+    if recorded != digests:
+        got, expected, fix = str(digests)[:120], str(recorded)[:120], "pass the base model of this adapter"
         raise InputError("the adapter was trained on another model", where=path, got=got, expected=expected, fix=fix)
     return {f"adapter/{file.name}": file for file in sorted(adapter.iterdir()) if file.is_file()}

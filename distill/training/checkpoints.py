@@ -17,18 +17,14 @@ CHECKPOINT_FORMAT = FileFormat("cosfly.checkpoint", "3.0", "checkpoint")
 
 
 class Progress(BaseModel):
-    """How far a training is.
-
-    best_step: of the best validation, 0 before the first; stale: number of validations since then. samples: digest of
-    the samples that are used, on which the order of the steps depends.
-    """
+    """How far a training is."""
 
     step: int = 0
-    best_step: int = 0
+    best_step: int = 0  # of the best validation, 0 before the first
     best_loss: float | None = None
-    stale: int = 0
+    stale: int = 0  # number of validations since the best one
     has_ended: bool = False
-    samples: str = ""
+    samples: str = ""  # digest of the samples that are used, on which the order of the steps depends
 
 
 def learning_weights(student: Student) -> dict[str, Any]:
@@ -75,19 +71,19 @@ def load_checkpoint(folder: Path, student: Student, optimizer: Any = None) -> Pr
 
     weights = learning_weights(student)
     try:
-        found = load_file(folder / WEIGHTS)
-        kept_moments = load_file(folder / MOMENTS) if optimizer is not None else {}
-        if found.keys() != weights.keys():
+        stored_weights = load_file(folder / WEIGHTS)
+        stored_moments = load_file(folder / MOMENTS) if optimizer is not None else {}
+        if stored_weights.keys() != weights.keys():
             raise ValueError("the weights are those of another student")
     except (SafetensorError, OSError, ValueError) as error:
         fix = f"remove {folder}, then run the same command again to resume from the previous checkpoint"
         raise InputError("the checkpoint is damaged", where=folder, got=str(error)[:200], fix=fix) from error
     with torch.no_grad():
         for name, parameter in weights.items():
-            parameter.copy_(found[name])
+            parameter.copy_(stored_weights[name])
     if optimizer is not None:
         moments: dict[str, dict[str, Any]] = {}
-        for key, value in kept_moments.items():
+        for key, value in stored_moments.items():
             name, _, moment = key.rpartition("/")
             moments.setdefault(name, {})[moment] = value
         state = {i: moments[name] for i, name in enumerate(weights) if name in moments}  # in the optimizer's order

@@ -59,7 +59,8 @@ def count_steps(cfg: TrainConfig, num_samples: int) -> tuple[int, int]:
 
 def steps_from(cfg: TrainConfig, num_samples: int, seed: int, first: int) -> Iterator[list[int]]:
     """Yield the sample indices of each step from one on: an epoch is a permutation, cut into steps."""
-    size, (num_steps, per_epoch) = cfg.samples_per_step, count_steps(cfg, num_samples)
+    size = cfg.samples_per_step
+    num_steps, per_epoch = count_steps(cfg, num_samples)
     for epoch in range(first // per_epoch, cfg.epochs):
         order = rng_for(seed, STAGE, f"epoch_{epoch}").permutation(num_samples).tolist()
         for step in range(max(first, epoch * per_epoch), min(num_steps, (epoch + 1) * per_epoch)):
@@ -68,11 +69,8 @@ def steps_from(cfg: TrainConfig, num_samples: int, seed: int, first: int) -> Ite
 
 
 def share_of(chosen: Sequence[int], lengths: np.ndarray, rank: int, num_ranks: int) -> list[int]:
-    """Return a process's samples of a step, longest first: dealt out by length, so that all have about the same to do.
-
-    Args:
-        chosen: the step's samples. lengths: (n,) tokens of every sample.
-    """
+    """Return a process's samples of a step, longest first: they are dealt out by their `lengths`, (n,) tokens of every
+    sample, so that all processes have about the same to do."""
     return sorted(chosen, key=lambda index: (-int(lengths[index]), index))[rank::num_ranks]
 
 
@@ -96,8 +94,9 @@ def first_signal() -> Iterator[list[int]]:
         os.write(2, STOPPING)
 
     with contextlib.ExitStack() as handlers:
-        for number in LEFT_TO_THE_PARENT if threading.current_thread() is threading.main_thread() else ():
-            handlers.callback(signal.signal, number, signal.signal(number, receive))
+        if threading.current_thread() is threading.main_thread():
+            for number in LEFT_TO_THE_PARENT:
+                handlers.callback(signal.signal, number, signal.signal(number, receive))
         yield received
 
 
@@ -116,15 +115,16 @@ def make_optimizer(student: Student, cfg: TrainConfig) -> Any:
     """Make AdamW of the weights that learn."""
     import torch
 
-    own: Any = {"lr": cfg.learning_rate, "weight_decay": 0.0, "fused": student.device == "cuda"}
-    return torch.optim.AdamW(learning_weights(student).values(), **own)
+    settings: Any = {"lr": cfg.learning_rate, "weight_decay": 0.0, "fused": student.device == "cuda"}
+    return torch.optim.AdamW(learning_weights(student).values(), **settings)
 
 
 def add_gradients(parameters: Sequence[Any], accelerator: Any) -> None:
     """Add up the gradients of all processes, of which some may have no sample in the step."""
-    for parameter in parameters if accelerator.num_processes > 1 else ():
-        own = parameter.new_zeros(parameter.shape) if parameter.grad is None else parameter.grad
-        parameter.grad = accelerator.reduce(own, "sum")
+    if accelerator.num_processes > 1:
+        for parameter in parameters:
+            gradient = parameter.new_zeros(parameter.shape) if parameter.grad is None else parameter.grad
+            parameter.grad = accelerator.reduce(gradient, "sum")
 
 
 def train_step(
@@ -133,28 +133,29 @@ def train_step(
     """Take one optimizer step over the samples of all processes, `batch_size` samples at a time.
 
     Returns:
-        loss (nats per answer token, weighted), gradient_norm, answer_tokens, tokens, samples: of all processes.
+        Facts of all processes: loss (weighted nats per answer token), gradient_norm, answer_tokens, tokens, samples.
     """
     import torch
 
     cfg, student = context.cfg, context.student
     student.model.train()
     parameters = list(learning_weights(student).values())
-    own_nats = 0.0
+    nats = 0.0
     for start in range(0, len(chosen), cfg.batch_size):
         batch = chosen[start : start + cfg.batch_size]
-        nats = answer_loss(student, [sample.row for sample in batch], context.features_of(batch), LOGIT_CHUNK)
-        nats.backward()
-        own_nats += float(nats.detach())
-    rows = [sample.row for sample in chosen]
-    own = sum(row.weight for row in rows), sum(len(row.answer_ids) for row in rows), sum(map(len, rows)), len(rows)
+        loss = answer_loss(student, [sample.row for sample in batch], context.features_of(batch), LOGIT_CHUNK)
+        loss.backward()
+        nats += float(loss.detach())
     add_gradients(parameters, context.accelerator)
-    total, weight, answer_tokens, tokens, samples = context.total([own_nats, *map(float, own)])
+    rows = [sample.row for sample in chosen]
+    weight, num_answer_tokens = sum(row.weight for row in rows), sum(len(row.answer_ids) for row in rows)
+    of_this_process = [nats, weight, num_answer_tokens, sum(map(len, rows)), len(rows)]
+    nats, weight, *counts = context.total([float(value) for value in of_this_process])
     for parameter in parameters:
         if parameter.grad is not None:
             parameter.grad /= weight
     norm = float(torch.nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM))
-    if not math.isfinite(total) or not math.isfinite(norm):
+    if not math.isfinite(nats) or not math.isfinite(norm):
         words, got = "the loss or the gradient became infinite or NaN", f"{cfg.learning_rate}"
         fix = "lower learning_rate and choose another --out; the last checkpoint is still usable"
         raise ConfigError(words, where="learning_rate", got=got, fix=fix)
@@ -162,8 +163,9 @@ def train_step(
         group["lr"] = rate
     optimizer.step()
     optimizer.zero_grad(set_to_none=True)
-    counts = {"answer_tokens": answer_tokens, "tokens": tokens, "samples": samples}
-    return {"loss": total / weight, "gradient_norm": norm, **{name: int(count) for name, count in counts.items()}}
+    answer_tokens, tokens, samples = map(int, counts)
+    facts = {"answer_tokens": answer_tokens, "tokens": tokens, "samples": samples}
+    return {"loss": nats / weight, "gradient_norm": norm, **facts}
 
 
 def fit(context: TrainingContext, out: Path) -> Progress:
@@ -173,15 +175,17 @@ def fit(context: TrainingContext, out: Path) -> Progress:
     """
     from accelerate.utils import gather_object
 
-    student, cfg, accelerator, folder = context.student, context.cfg, context.accelerator, out / CHECKPOINTS
-    places = [[sample.place for sample in split.used] for split in (context.train, context.val)]
-    used = sha256_bytes(dump_json(places).encode())  # the order of the steps depends on the samples that are used
-    if len(set(gather_object([used]))) > 1:
+    student, cfg, accelerator = context.student, context.cfg, context.accelerator
+    folder = out / CHECKPOINTS
+    indices = [[sample.sample_index for sample in split.used] for split in (context.train, context.val)]
+    used_digest = sha256_bytes(dump_json(indices).encode())  # the order of the steps depends on the samples used
+    if len(set(gather_object([used_digest]))) > 1:
         fix = "check that all processes can read the same pictures, then run the same command again"
         raise InputError("the processes of this training find different samples", where=STAGE, fix=fix)
-    optimizer, newest = make_optimizer(student, cfg), newest_checkpoint(folder)
-    progress = load_checkpoint(newest, student, optimizer) if newest else Progress(samples=used)
-    if progress.samples != used:
+    optimizer = make_optimizer(student, cfg)
+    newest = newest_checkpoint(folder)
+    progress = load_checkpoint(newest, student, optimizer) if newest else Progress(samples=used_digest)
+    if progress.samples != used_digest:
         fix = "restore the pictures as they were, or choose another --out"
         raise ResumeError("the usable samples have changed since the training began", where=out, fix=fix)
     words = f"resumed after step {progress.step}" if newest else "no checkpoint yet: begins with the first step"
@@ -203,24 +207,26 @@ def fit(context: TrainingContext, out: Path) -> Progress:
 
 
 def _take_steps(context: TrainingContext, optimizer: Any, progress: Progress, folder: Path, note: Note) -> Progress:
+    """Take the steps after those of `progress`, with validations and checkpoints; return the progress at the end."""
     cfg, accelerator, lengths = context.cfg, context.accelerator, context.train.lengths
-    first, start_s, mine = progress.step, time.monotonic(), (accelerator.process_index, accelerator.num_processes)
+    rank, num_ranks = accelerator.process_index, accelerator.num_processes
     num_steps, per_epoch = count_steps(cfg, len(lengths))
+    first = progress.step
+    start_s = time.monotonic()
     step_start_s = saved_s = start_s
     with progress_bar(STAGE, total=num_steps, done=first) as advance, first_signal() as received:
-        for step, numbers in enumerate(steps_from(cfg, len(lengths), context.seed, first), first):
-            chosen = [context.train.used[number] for number in share_of(numbers, lengths, *mine)]
+        for step, indices in enumerate(steps_from(cfg, len(lengths), context.seed, first), first):
+            chosen = [context.train.used[i] for i in share_of(indices, lengths, rank, num_ranks)]
             rate = learning_rate_at(cfg, step, num_steps)
-            with seeded(context.student, context.seed, f"step_{step}_{accelerator.process_index}"):
+            with seeded(context.student, context.seed, f"step_{step}_{rank}"):
                 facts = train_step(context, optimizer, chosen, rate)
             done, now_s = step + 1, time.monotonic()
             seconds = max(now_s - step_start_s, 1e-9)
             speed = {
-                "seconds": round(seconds, 4),
-                "tokens_per_s": round(facts["tokens"] / seconds, 1),
+                "seconds": round(seconds, 4), "tokens_per_s": round(facts["tokens"] / seconds, 1),
                 "memory_gb": round(used_gb(context.student.device), 3),
                 "left_s": round((now_s - start_s) / (done - first) * (num_steps - done), 1),
-            }
+            }  # fmt: skip
             record = {"step": done, "epoch": step // per_epoch, "learning_rate": rate}
             note({**record, **facts, "speed": speed})
             progress = progress.model_copy(update={"step": done})
@@ -257,7 +263,7 @@ def validate(context: TrainingContext, progress: Progress, note: Note) -> Progre
     context.student.model.eval()
     with torch.no_grad(), progress_bar(f"{STAGE}: validation", total=len(order)) as advance:
         for start in range(0, len(order), cfg.batch_size):
-            batch = [split.used[number] for number in order[start : start + cfg.batch_size]]
+            batch = [split.used[i] for i in order[start : start + cfg.batch_size]]
             rows = [sample.row for sample in batch]
             nats += float(answer_loss(context.student, rows, context.features_of(batch), LOGIT_CHUNK))
             weight += sum(row.weight for row in rows)
@@ -294,6 +300,10 @@ def _note(context: TrainingContext, path: Path, record: dict[str, Any]) -> None:
         return
     with storage_errors(path), open(path, "a", encoding="utf-8") as file:
         file.write(dump_json(record) + "\n")
-    parts = {name: part if isinstance(part, dict) else {"": part} for name, part in record.items() if name != "step"}
-    numbers = {f"{name}/{inner}".rstrip("/"): value for name, part in parts.items() for inner, value in part.items()}
+    numbers: dict[str, Any] = {}  # flat: {"speed": {"seconds": 1}} becomes {"speed/seconds": 1}
+    for name, value in record.items():
+        if isinstance(value, dict):
+            numbers |= {f"{name}/{inner}": number for inner, number in value.items()}
+        elif name != "step":
+            numbers[name] = value
     context.accelerator.log(numbers, step=record["step"])

@@ -32,9 +32,8 @@ ResultT = TypeVar("ResultT")
 
 
 @dataclass(frozen=True)
-class _Work:
-    """A function as a data set whose indices are its arguments. An error is returned, because the loader would raise
-    another one in its place."""
+class _Computed:
+    """A data set of the results of a function. It returns errors, because the loader would replace a raised one."""
 
     function: Callable[[Any], Any]
 
@@ -46,6 +45,7 @@ class _Work:
 
 
 def _start_worker(parent_pid: int, _: int) -> None:
+    """Prepare a worker process: it ends with its parent, ignores signals for that, and uses one thread."""
     import cv2
     import torch
 
@@ -56,19 +56,17 @@ def _start_worker(parent_pid: int, _: int) -> None:
     cv2.setNumThreads(0)
 
 
-def in_order(function: Callable[[ItemT], ResultT], items: Sequence[ItemT], wanted: int) -> Iterator[ResultT]:
-    """Yield function(item) for each item, in order, computed ahead by worker processes.
-
-    Args:
-        wanted: most worker processes; 0: none, negative: one per CPU, at most MOST_WORKERS.
-    """
+def in_order(function: Callable[[ItemT], ResultT], items: Sequence[ItemT], max_workers: int) -> Iterator[ResultT]:
+    """Yield function(item) for each item, in order, computed ahead by worker processes: at most so many, 0 for none,
+    negative for one per CPU up to MOST_WORKERS."""
     import torch
 
     os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")  # threads do not survive the fork
-    most = wanted if wanted >= 0 else min(MOST_WORKERS, num_cpus())
-    workers = min(most, len(items) // SAMPLES_PER_WORKER)
+    if max_workers < 0:
+        max_workers = min(MOST_WORKERS, num_cpus())
+    workers = min(max_workers, len(items) // SAMPLES_PER_WORKER)
     loader: Any = torch.utils.data.DataLoader(
-        _Work(function),  # type: ignore[arg-type]  # all that the loader asks of a data set
+        _Computed(function),  # type: ignore[arg-type]  # a loader without batches needs nothing else
         batch_size=None,
         sampler=items,
         num_workers=workers,
@@ -83,56 +81,63 @@ def in_order(function: Callable[[ItemT], ResultT], items: Sequence[ItemT], wante
 
 
 class TrainingSample(NamedTuple):
-    """A sample as tokens, with its pictures. place: its index in the split."""
+    """A sample as tokens, with its pictures."""
 
-    place: int
+    sample_index: int  # in the split
     row: EncodedSample
     pictures: tuple[FramePicture, ...]
 
 
+class SkippedSample(NamedTuple):
+    """A sample that cannot be used."""
+
+    reason: str
+    message: str  # the sample, and what is wrong with it
+
+
 @dataclass
 class TrainingSplit:
-    """The samples of a split as tokens.
-
-    used: by increasing place. skipped: reason -> what was found in each sample that cannot be used.
-    """
+    """The samples of a split as tokens."""
 
     samples: Sequence[Sample]
     processor: Processor
     max_pixels: int
     decision_weight: float
-    used: list[TrainingSample] = field(default_factory=list)
-    skipped: defaultdict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    used: list[TrainingSample] = field(default_factory=list)  # by increasing index
+    skipped: defaultdict[str, list[str]] = field(default_factory=lambda: defaultdict(list))  # reason -> messages
 
-    def encode(self, places: Sequence[int], max_tokens: int, workers: int) -> None:
+    def encode(self, indices: Sequence[int], max_tokens: int, workers: int) -> None:
         """Encode samples, and skip those that cannot be used."""
         known: dict[FramePicture, FramePicture] = {}  # equal pictures become one object
-        encoded = in_order(partial(self._encode, max_tokens=max_tokens), places, workers)
-        with progress_bar(f"{STAGE}: encoding texts", total=len(places)) as advance:
-            for found in encoded:
-                if isinstance(found, TrainingSample):
-                    pictures = tuple(known.setdefault(picture, picture) for picture in found.pictures)
-                    self.used.append(found._replace(pictures=pictures))
+        encoded = in_order(partial(self._encode, max_tokens=max_tokens), indices, workers)
+        with progress_bar(f"{STAGE}: encoding texts", total=len(indices)) as advance:
+            for sample in encoded:
+                if isinstance(sample, SkippedSample):
+                    self.skipped[sample.reason].append(sample.message)
                 else:
-                    self.skipped[found[0]].append(found[1])
+                    pictures = tuple(known.setdefault(picture, picture) for picture in sample.pictures)
+                    self.used.append(sample._replace(pictures=pictures))
                 advance(1)
 
-    def _encode(self, place: int, max_tokens: int) -> TrainingSample | tuple[str, str]:
-        """Return a sample as tokens, or why it is skipped."""
-        sample = self.samples[place]
+    def _encode(self, index: int, max_tokens: int) -> TrainingSample | SkippedSample:
+        sample = self.samples[index]
         if token := special_token_in(self.processor, sample):
-            return "special_token", f"{sample.key}: a text contains {token}"
+            return SkippedSample("special_token", f"{sample.key}: a text contains {token}")
         row = self.processor.encode(sample, self.max_pixels, self.decision_weight)
         if len(row) > max_tokens:
-            return "too_long", f"{sample.key}: {len(row)} tokens"
-        return TrainingSample(place, row, tuple(pictures_of(sample)))
+            return SkippedSample("too_long", f"{sample.key}: {len(row)} tokens")
+        return TrainingSample(index, row, tuple(pictures_of(sample)))
 
     def skip_unreadable(self, unreadable: Mapping[FramePicture, str]) -> None:
-        """Skip the samples with a picture that cannot be read."""
-        errors = [next((unreadable[p] for p in sample.pictures if p in unreadable), "") for sample in self.used]
-        if any(errors):
-            self.skipped["unreadable_picture"] += filter(None, errors)
-            self.used = [sample for sample, words in zip(self.used, errors, strict=True) if not words]
+        """Skip the samples with a picture that cannot be read, given the messages of such pictures."""
+        readable = []
+        for sample in self.used:
+            messages = [unreadable[picture] for picture in sample.pictures if picture in unreadable]
+            if messages:
+                self.skipped["unreadable_picture"].append(messages[0])
+            else:
+                readable.append(sample)
+        self.used = readable
 
     @property
     def lengths(self) -> np.ndarray:
@@ -162,25 +167,27 @@ class TrainingContext:
         splits = self.train, self.val
         pictures = list(dict.fromkeys(p for split in splits for sample in split.used for p in sample.pictures))
         with progress_bar(f"{STAGE}: pictures", total=len(pictures)) as advance:
-            read = in_order(self.reader.try_to_read, pictures, self.cfg.data_workers)
-            counted = (advance(1) or tensors for tensors in read)
-            own: Any = {"is_frozen": not self.cfg.train_vision, "most_bytes": most_bytes}
-            found = read_features(self.student, pictures, counted, **own)
-        self.features = {picture: tensors for picture, tensors in found.items() if not isinstance(tensors, str)}
-        if num_others := len(pictures) - len(found):
+            inputs = in_order(self.reader.try_to_read, pictures, self.cfg.data_workers)
+            counted = (advance(1) or result for result in inputs)
+            results = read_features(
+                self.student, pictures, counted, is_frozen=not self.cfg.train_vision, most_bytes=most_bytes
+            )
+        self.features = {picture: tensors for picture, tensors in results.items() if not isinstance(tensors, str)}
+        if num_not_kept := len(pictures) - len(results):
             words = "%s: the features of %d pictures do not fit into the memory: they are encoded at each use"
-            log.warning(words, STAGE, num_others)
+            log.warning(words, STAGE, num_not_kept)
+        unreadable = {picture: message for picture, message in results.items() if isinstance(message, str)}
         for split in splits:
-            split.skip_unreadable({picture: words for picture, words in found.items() if isinstance(words, str)})
+            split.skip_unreadable(unreadable)
 
     def features_of(self, samples: Iterable[TrainingSample]) -> list[Tensors]:
         """Return the features of the pictures of samples, sample after sample."""
         pictures = [picture for sample in samples for picture in sample.pictures]
-        others = [picture for picture in dict.fromkeys(pictures) if picture not in self.features]
-        read = map(self.reader.read, others)
-        again: Any = read_features(self.student, others, read, is_frozen=not self.cfg.train_vision)
-        found = [again[picture] if picture in again else self.features[picture] for picture in pictures]
-        return encode(self.student, found) if self.cfg.train_vision else found
+        not_kept = [picture for picture in dict.fromkeys(pictures) if picture not in self.features]
+        inputs = map(self.reader.read, not_kept)
+        again: Any = read_features(self.student, not_kept, inputs, is_frozen=not self.cfg.train_vision)
+        features = [again[picture] if picture in again else self.features[picture] for picture in pictures]
+        return encode(self.student, features) if self.cfg.train_vision else features
 
     def total(self, values: Sequence[float]) -> list[float]:
         """Add up numbers over all processes."""

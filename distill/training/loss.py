@@ -72,20 +72,18 @@ def chunked_loss(hidden: Any, head: Any, targets: Any, weights: Any, *, chunk: i
     return _chunked_loss().apply(hidden, head, targets, weights, chunk, dtype)
 
 
-def answer_loss(student: Student, rows: Sequence[EncodedSample], pictures: Sequence[Tensors], chunk: int) -> Any:
-    """Run samples forward, padded on the right, and return the sum over all answer tokens of weight times nats.
-
-    Args:
-        pictures: features of the pictures of all rows, row after row.
-    """
+def answer_loss(student: Student, rows: Sequence[EncodedSample], features: Sequence[Tensors], chunk: int) -> Any:
+    """Run samples forward, padded on the right, and return the sum over all answer tokens of weight times nats;
+    `features` are those of the pictures of all rows, row after row."""
     import torch
 
-    given = {name: torch.from_numpy(array).to(student.device) for name, array in padded(student, rows).items()}
-    labels, weights = given.pop("labels")[:, 1:], given.pop("weights")[:, 1:]
-    with student.computing(), with_encoded_pictures(student, pictures) as inputs:
-        hidden = student.core.base_model(**given, **inputs, use_cache=False).last_hidden_state
-    is_target = labels != IGNORED  # the token at i is predicted at i - 1
-    head, hidden = student.core.get_output_embeddings().weight, hidden[:, :-1][is_target]
+    batch = {name: torch.from_numpy(array).to(student.device) for name, array in padded(student, rows).items()}
+    labels, weights = batch.pop("labels")[:, 1:], batch.pop("weights")[:, 1:]
+    with student.computing(), with_encoded_pictures(student, features) as picture_inputs:
+        hidden = student.core.base_model(**batch, **picture_inputs, use_cache=False).last_hidden_state
+    is_target = labels != IGNORED
+    hidden = hidden[:, :-1][is_target]  # the token at i is predicted at i - 1
+    head = student.core.get_output_embeddings().weight
     return chunked_loss(hidden, head, labels[is_target], weights[is_target], chunk=chunk, dtype=student.dtype)
 
 

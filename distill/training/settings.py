@@ -14,8 +14,7 @@ STAGE = "distill.train"
 
 
 class TrainConfig(Config):
-    """Settings of `distill train`. Those that are MayDiffer change how it is computed and, but for rounding, not
-    what."""
+    """Settings of `distill train`; those that are MayDiffer change, but for rounding, only how it is computed."""
 
     method: Literal["lora", "full"] = Field(
         "lora", description="lora: train small matrices next to frozen weights; full: train all weights"

@@ -38,12 +38,8 @@ TOKENIZER_SAMPLES = 2000  # most samples that the tokenizer of a random student 
 PATIENCE = timedelta(minutes=30)  # for the slowest process: loading weights, encoding texts, validation
 
 
-def taught_by(samples: Sequence[Sample], max_pixels: int) -> ChatFormat:
-    """Return the chat format of a training.
-
-    Args:
-        max_pixels: limit of a picture; 0: none.
-    """
+def chat_format_of(samples: Sequence[Sample], max_pixels: int) -> ChatFormat:
+    """Return the chat format of a training on samples, with a limit of the pixels of a picture, 0 for none."""
     lengths = {len(sample.frames) for sample in samples}
     if len(lengths) != 1:
         fix = "prepare the training set from captions with the same caption.window.num_frames"
@@ -101,10 +97,11 @@ def prepared_student(cfg: TrainConfig, base: Path, seed: int, device: str) -> St
         add_adapter(student, cfg, seed)
     else:
         student.model.requires_grad_(True)
-        language = {*student.core.get_decoder().modules(), student.core.get_output_embeddings()}
-        for module in student.core.base_model.children() if student.has_pictures and not cfg.train_vision else ():
-            if module not in language:
-                module.requires_grad_(False)  # in float32 as the rest: SmolVLM takes the type of its tower for all
+        if student.has_pictures and not cfg.train_vision:
+            language_model = {*student.core.get_decoder().modules(), student.core.get_output_embeddings()}
+            for module in student.core.base_model.children():
+                if module not in language_model:
+                    module.requires_grad_(False)  # in float32 as the rest: SmolVLM computes in the type of its tower
     if cfg.compile:
         for layer in student.core.get_decoder().layers:
             layer.compile(dynamic=True)
@@ -174,13 +171,7 @@ def torch_errors(cfg: TrainConfig) -> Iterator[None]:
 
 
 def run(
-    cfg: TrainConfig,
-    dataset: Path,
-    data: Sequence[Path],
-    student: str | Path,
-    out: Path,
-    *,
-    seed: int = 0,
+    cfg: TrainConfig, dataset: Path, data: Sequence[Path], student: str | Path, out: Path, *, seed: int = 0
 ) -> Path:
     """Read a training set, its playback trees and a student; write `adapter/` or `model/`, `log.jsonl`, `checkpoints/`.
 
@@ -188,7 +179,7 @@ def run(
         student: a folder, a GGUF file, the name of a repository, or `tiny` or `random`, which are made in `out`.
 
     Returns:
-        The folder of the adapter, which peft loads, or of the model, which transformers loads.
+        The folder `adapter/`, which peft loads, or `model/`, which transformers loads.
 
     Raises:
         InputError: an input is missing or does not fit. ResumeError: another process is at work in `out`.
@@ -219,20 +210,21 @@ def run(
                 chosen = samples[:: max(1, len(samples) // TOKENIZER_SAMPLES)]
                 texts = (text for s in chosen for text in (s.prompt.system, s.prompt.user, s.answer))
                 make_random_student(base, random_student, seed, texts)
-        if broadcast_object_list([folder is not None and folder.is_complete])[0]:
+        is_complete = folder is not None and folder.is_complete
+        if broadcast_object_list([is_complete])[0]:  # all processes know what the main one knows
             return product
         accelerator.init_trackers(STAGE)
-        context, taught = _context(cfg, dataset, trees, base, seed, accelerator)
+        context, chat_format = _context(cfg, dataset, trees, base, seed, accelerator)
         progress = fit(context, out)
         if folder is not None:
-            used = context.train.used
-            skipped = Counter({reason: len(found) for reason, found in context.train.skipped.items()})
-            tally = Tally(input=len(used) + skipped.total(), kept=len(used), dropped=skipped)
+            num_used = len(context.train.used)
+            skipped = Counter({reason: len(samples) for reason, samples in context.train.skipped.items()})
+            tally = Tally(input=num_used + skipped.total(), kept=num_used, dropped=skipped)
             if cfg.method == "full":
                 context.student.model.to(context.student.dtype)
             with atomic_folder(product) as partial:
                 write_student(context.student, partial, base, base_name)
-                write_chat_format(partial, taught)
+                write_chat_format(partial, chat_format)
             folder.finish(
                 [out / LOG, *sorted(product.iterdir())], tally, steps=progress.step, best_step=progress.best_step,
                 tokens=int(context.train.lengths.sum()),
@@ -247,7 +239,7 @@ def run(
 def _context(
     cfg: TrainConfig, dataset: Path, trees: dict[str, Path], base: Path, seed: int, accelerator: Any
 ) -> tuple[TrainingContext, ChatFormat]:
-    """Load the student and the data, check them, and log what will be trained."""
+    """Load the student and the data, check them, and log what will be trained; return also the chat format."""
     student = prepared_student(cfg, base, seed, pick_device(cfg.device))
     samples, validation = (open_split(dataset, split, text_only=not student.has_pictures) for split in ("train", "val"))
     if not samples:
@@ -257,22 +249,29 @@ def _context(
         log.warning("%s: the student takes no pictures: it is taught with the text state alone", STAGE)
     check_template(student, samples[0])
     check_head(student)
-    taught = taught_by(samples, cfg.max_pixels)  # its errors come before the training
-    train, val = (TrainingSplit(part, student, cfg.max_pixels, cfg.decision_weight) for part in (samples, validation))
-    order = rng_for(seed, STAGE, "validation").permutation(len(validation))
+    chat_format = chat_format_of(samples, cfg.max_pixels)  # its errors come before the training
+    train = TrainingSplit(samples, student, cfg.max_pixels, cfg.decision_weight)
     train.encode(range(len(samples)), cfg.max_tokens, cfg.data_workers)
+    val = TrainingSplit(validation, student, cfg.max_pixels, cfg.decision_weight)
+    order = rng_for(seed, STAGE, "validation").permutation(len(validation))
     val.encode(sorted(order[: cfg.validation_samples].tolist()), cfg.max_tokens, cfg.data_workers)
     reader = PictureReader(student, trees, cfg.max_pixels)
     context = TrainingContext(student, cfg, seed, accelerator, train, val, reader)
     context.read_pictures()
-    for name, split in {"train": train, **({"val": val} if cfg.validation_samples else {})}.items():
-        words = "%s: %s has %d samples with %d tokens, %d of them in answers"
-        num_answer = sum(len(sample.row.answer_ids) for sample in split.used)
-        log.info(words, STAGE, name, len(split.used), split.lengths.sum(), num_answer)
-        for reason, found in sorted(split.skipped.items()):
-            note = "%s: %d samples of %s are skipped as %s; the first: %s"
-            log.warning(note, STAGE, len(found), name, reason, found[0])
+    _log_split("train", train)
+    if cfg.validation_samples:
+        _log_split("val", val)
     if not train.used:
         words, got = "no sample can be used for training", ", ".join(train.skipped)
         raise InputError(words, where=dataset, got=got, fix="change the settings that cause the warnings above")
-    return context, taught
+    return context, chat_format
+
+
+def _log_split(name: str, split: TrainingSplit) -> None:
+    """Log how many samples are used, and warn of those that are skipped."""
+    words = "%s: %s has %d samples with %d tokens, %d of them in answers"
+    num_answer = sum(len(sample.row.answer_ids) for sample in split.used)
+    log.info(words, STAGE, name, len(split.used), split.lengths.sum(), num_answer)
+    for reason, skipped in sorted(split.skipped.items()):
+        words = "%s: %d samples of %s are skipped as %s; the first: %s"
+        log.warning(words, STAGE, len(skipped), name, reason, skipped[0])

@@ -86,14 +86,8 @@ class CaptionAccount:
 def index_captions(
     path: Path, released: Mapping[FlightKey, TrackCaptions], not_released: set[FlightKey], account: CaptionAccount
 ) -> None:
-    """Read the captions of a tree once; add those of released tracks to these, and all to the account.
-
-    Args:
-        not_released: The other tracks of the tree.
-
-    Raises:
-        InputError: A caption is of another tree, lacks a language, or repeats a frame.
-    """
+    """Read the captions of a tree once; add those of released tracks to these, and all to the account. InputError if a
+    caption is of no track of the tree, lacks a language, or repeats a frame."""
     for span, caption in caption_spans(path):
         key = (caption.town, caption.trajectory, caption.variant)
         try:

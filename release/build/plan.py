@@ -80,11 +80,8 @@ class ReleasePlan:
 
 
 def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> ReleasePlan:
-    """Read all of the material but the pictures, and decide what is released where.
-
-    Raises:
-        InputError, VerifyError: The material cannot be released.
-    """
+    """Read all of the material but the pictures, and decide what is released where; InputError or VerifyError if it
+    cannot be released."""
     material = gather(sources, include_review=cfg.include_review, choice=TrackChoice(match=cfg.flights))
     tracks, walks, dropped = survey_tracks(material.candidates, sources, cfg.tracks)
     tracks, without_twin = keep_pairs(tracks, cfg)
@@ -105,14 +102,8 @@ def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> 
 def survey_tracks(
     candidates: list[Candidate], sources: list[Source], tracks: tuple[TrackName, ...]
 ) -> tuple[list[Chosen], dict[str, str], Counter[str]]:
-    """Read the tracks that no inspection drops.
-
-    Args:
-        tracks: The kinds of track to release.
-
-    Returns:
-        The tracks of these kinds; trajectory -> walk; why others are dropped.
-    """
+    """Read the tracks that no inspection drops; return those of the kinds `tracks`, trajectory -> walk, and the counts
+    of the others by reason."""
     chosen: list[Chosen] = []
     dropped = Counter(candidate.dropped for candidate in candidates if candidate.dropped is not None)
     remaining = [candidate for candidate in candidates if candidate.dropped is None]
@@ -137,8 +128,7 @@ def survey_tracks(
 
 
 def open_track(candidate: Candidate) -> Track:
-    """Read a track under the name that it has in the release: trees of cosfly strictly, those of others as far as the
-    public layout demands."""
+    """Read a track under its name in the release; trees of cosfly must fit our own format, others the public one."""
     track = read_track(candidate.folder)
     if track.is_ours and track.issues:
         raise track.issues[0]
@@ -247,8 +237,7 @@ def place_tracks(tracks: list[Chosen], walks: dict[str, str], cfg: ReleaseConfig
 
 
 def shards_of(tracks: list[Chosen], target_bytes: int) -> list[PlannedShard]:
-    """Return the shards in the order of the release: split by split, and in each whole trajectories, both tracks of one
-    next to each other."""
+    """Return the shards split by split, each of whole trajectories with their tracks next to each other."""
     shards: list[PlannedShard] = []
     for split in SPLIT_NAMES:
         trajectories = defaultdict[str, list[Chosen]](list)

@@ -52,11 +52,8 @@ class ShardResult(BaseModel):
 def write_shard(
     path: Path, tracks: Sequence[Chosen], files: Collection[FrameFile], row_group_bytes: int
 ) -> ShardResult:
-    """Write the selected frames of some tracks, and all of their points, a row group each.
-
-    Raises:
-        InputError, VerifyError: Names the first file that cannot be released.
-    """
+    """Write the selected frames of some tracks, and all of their points, a row group each; InputError or VerifyError
+    names the first file that cannot be released."""
     points_path, schema = points_part(path), columns.points_schema()
     with (
         atomic_file(points_path) as points_file,
@@ -128,15 +125,9 @@ def open_writer(sink: str | IO[bytes], schema: pa.Schema) -> pq.ParquetWriter:
     small = [name for name in leaves if name != PICTURES["depth"].name and not name.endswith(".bytes")]
     repeated = [name for name in small if name in schema.names and schema.field(name).type == pa.string()]
     return pq.ParquetWriter(
-        sink,
-        schema,
-        compression=compression,
-        use_dictionary=repeated,
-        write_statistics=small,
-        version="2.6",
-        write_page_index=True,
-        write_batch_size=VALUES_PER_BATCH,
-    )
+        sink, schema, compression=compression, use_dictionary=repeated, write_statistics=small, version="2.6",
+        write_page_index=True, write_batch_size=VALUES_PER_BATCH,
+    )  # fmt: skip
 
 
 def _write_frames(chosen: Chosen, track: Track, files: Collection[FrameFile], frames: _RowGroups) -> None:
@@ -180,18 +171,17 @@ def _check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where
         if not 0.0 <= low <= high <= SKY_DEPTH_M:
             what, expected = "the depth image has values that are not depths", f"0 to {SKY_DEPTH_M:g} m"
             raise InputError(what, where=where, got=f"{low:g} to {high:g} m", expected=expected, fix=RENDER)
-        found: tuple[int, ...] | None = depth.shape[::-1]
+        picture_px: tuple[int, ...] | None = depth.shape[::-1]
     else:
-        found = png_size(data) if is_inspected else colours_of(data, where).shape[1::-1]
-    if found != size_px:
-        got = "no PNG" if found is None else "{} x {} px".format(*found)
+        picture_px = png_size(data) if is_inspected else colours_of(data, where).shape[1::-1]
+    if picture_px != size_px:
+        got = "no PNG" if picture_px is None else "{} x {} px".format(*picture_px)
         expected = "{} x {} px".format(*size_px)
         raise InputError("the picture has the wrong size", where=where, got=got, expected=expected, fix=RENDER)
 
 
 def _digests(candidate: Candidate) -> dict[str, str]:
-    """Return the sha256 of each file of a track, if they are recorded; VerifyError if the track has changed since its
-    inspection."""
+    """Return the recorded sha256 of each file of a track; VerifyError if it has changed since its inspection."""
     folder = candidate.folder
     if candidate.sha256 is None:
         digests = read_checksums(folder) if (folder / CHECKSUMS).is_file() else {}

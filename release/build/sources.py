@@ -193,8 +193,7 @@ def maps_of(candidates: list[Candidate]) -> list[ReleasedMap]:
 
 
 def _place(source: Source, folder: Path) -> Place:
-    """Return the place of a track by its folder in the tree. Folders above the town, in a tree of several, are part of
-    the run's name."""
+    """Return the place of a track by its folder in the tree; folders above the town are part of the run's name."""
     town, trajectory, variant = ("", "", *folder.parts)[-3:]
     return Place("_".join((source.run, *folder.parts[:-3])), town, trajectory, variant)
 

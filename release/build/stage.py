@@ -94,9 +94,7 @@ def _write_parts(
     cfg: ReleaseConfig, plan: ReleasePlan, stage: StageFolder, parts: Path, workers: int, watch: Watch
 ) -> list[tuple[Path, Shard]]:
     """Write all shards that are not written yet; return all, with their files until the release has its name."""
-    items = [
-        Item(shard.name, shard.tracks, sum(len(track.selected) for track in shard.tracks)) for shard in plan.shards
-    ]
+    items = [Item(part.name, part.tracks, sum(len(track.selected) for track in part.tracks)) for part in plan.shards]
     arguments = (cfg.modalities, cfg.row_group_bytes, parts)
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="release: frames")
     if failed := [record for record in finished.records if isinstance(record, Failed)]:
@@ -111,8 +109,7 @@ def _write_parts(
 
 
 def name_shards(parts: Sequence[tuple[Path, Shard]], folder: Path) -> list[Shard]:
-    """Link the files of shards under their names in the release, so that no byte moves and a kill costs nothing; return
-    the shards with these names."""
+    """Link the files of shards under their names in the release, so that no byte moves; return the named shards."""
     digest = digest_of([shard for _, shard in parts])
     for name in (FRAMES_FOLDER, POINTS_FOLDER):
         (folder / name).mkdir()
@@ -153,8 +150,8 @@ def provenance_of(sources: list[Source], inputs: Mapping[str, StageInput], accou
 def _source(source: Source, names: dict[str, str], inputs: Mapping[str, StageInput]) -> SourceRecord:
     sha256 = {f"{role}_sha256": inputs[names[role]].sha256 for role in SOURCE_FILES if role in names}
     stages = [
-        SourceStage(stage=one.stage, code_version=one.code_version, seed=one.seed, config=published(one.config))
-        for one in stages_behind(source.files.values())
+        SourceStage(stage=made.stage, code_version=made.code_version, seed=made.seed, config=published(made.config))
+        for made in stages_behind(source.files.values())
     ]
     return SourceRecord(run=source.run, stages=stages, **sha256)
 

@@ -31,11 +31,11 @@ def render_card(record: ReleaseRecord) -> str:
         ours=[source.run for source in record.provenance.sources if _is_rendered_by_us(source)],
         others=[source.run for source in record.provenance.sources if not _is_rendered_by_us(source)],
         first_split=next(iter(splits), "train"), points=sum(shard.points.rows for shard in record.shards),
-        is_whole=all(one.frames == one.frames_available for one in record.flights), tables=tables_of(record),
+        is_whole=all(t.frames == t.frames_available for t in record.flights), tables=tables_of(record),
         shown=shown, fields=FIELDS, never_decided=[name for name in TOKENS if name not in decided],
         most_decided=max(decided.items(), key=lambda pair: pair[1], default=("none", 0)),
         repaired=repairs.total() - repairs["none"],
-        small_splits=[name for name, own in splits.items() if len(own.walks) < FEW_WALKS],
+        small_splits=[name for name, split in splits.items() if len(split.walks) < FEW_WALKS],
         coordinates=_coordinates(record), citation=read_text(Path(__file__).with_name("citation.bib")).strip(),
     )  # fmt: skip
 
@@ -59,13 +59,10 @@ def _front_matter(record: ReleaseRecord) -> str:
         for name, folder in (("default", FRAMES_FOLDER), ("points", POINTS_FOLDER))
     }
     matter = {
-        "license": for_terminal(record.licence),
-        "language": ["en", "zh"],
-        "pretty_name": for_terminal(record.name),
-        "task_categories": ["image-text-to-text", "robotics"],
-        "tags": tags,
+        "license": for_terminal(record.licence), "language": ["en", "zh"], "pretty_name": for_terminal(record.name),
+        "task_categories": ["image-text-to-text", "robotics"], "tags": tags,
         "configs": [{"config_name": name, "data_files": files} for name, files in configs.items()],
-    }
+    }  # fmt: skip
     return yaml.safe_dump(matter, sort_keys=False, allow_unicode=True).strip()
 
 

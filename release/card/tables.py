@@ -41,7 +41,7 @@ class Table(Record):
 
 
 SPREAD = ["mean", "std", "least", "most", "values"]  # the columns of `_spread`, after its title
-SPREADS = {  # of the record: their titles
+SPREADS = {  # name in the record -> title
     "track_frames": "frames per track",
     "track_duration_s": "duration of a track, s",
     "trajectory_length_m": "length of a trajectory, m",
@@ -127,7 +127,7 @@ def _spread(title: str, spread: Spread) -> list[Cell]:
 
 
 def _counted(title: str, counts: Mapping[str, int]) -> Rows:
-    """Return a row for each name that was counted. title: of a row, with {} for the name."""
+    """Return a row for each name that was counted; the title of a row has the name in place of {}."""
     return [[title.format(name), count] for name, count in counts.items()]
 
 
@@ -199,20 +199,21 @@ def _outcome_rows(record: ReleaseRecord) -> Rows:
 
 
 def _fovs(numbers: Numbers) -> Rows:
-    num_tracks, rows = numbers.of("tracks_by_fov"), Rows()
-    for fov, num_frames in sorted(numbers.of("fov").items()):
-        level = next((name for lens_deg, name in LEVEL_NAMES.items() if fov == f"{lens_deg:g}"), "")
-        rows.append([fov, num_tracks[fov], num_frames, level])
-    return rows
+    levels = {f"{fov_deg:g}": name for fov_deg, name in LEVEL_NAMES.items()}
+    num_tracks = numbers.of("tracks_by_fov")
+    num_frames = sorted(numbers.of("fov").items())
+    return [[fov, num_tracks[fov], count, levels.get(fov, "")] for fov, count in num_frames]
 
 
 def _weather(numbers: Numbers) -> tuple[list[str], Rows]:
     """Return head and rows: frames by preset and time of day, where a frame names one; the paper's first."""
     skies = numbers.of("sky")
-    presets, times = {sky.partition(TAB)[0] for sky in skies}, {sky.partition(TAB)[2] for sky in skies}
+    presets = {sky.partition(TAB)[0] for sky in skies}
+    times = {sky.partition(TAB)[2] for sky in skies}
     columns = [*TIMES, *sorted(times - {*TIMES})]
     names = [*WEATHERS, *sorted(presets - {*WEATHERS})] if skies else []
-    return ["preset", *columns], [[name, *(skies[f"{name}{TAB}{time}"] for time in columns)] for name in names]
+    rows: Rows = [[name, *(skies[f"{name}{TAB}{time}"] for time in columns)] for name in names]
+    return ["preset", *columns], rows
 
 
 def _events(numbers: Numbers) -> Rows:
@@ -235,7 +236,8 @@ def _confusion(numbers: Numbers) -> tuple[list[str], Rows]:
     counts = numbers.of("confusion")
     counted = {name for pair in counts for name in pair.split(TAB)}
     names = [name for name in (*TOKENS, "none") if name in counted]
-    return ["label", *names], [[label, *(counts[f"{label}{TAB}{other}"] for other in names)] for label in names]
+    rows: Rows = [[label, *(counts[f"{label}{TAB}{decision}"] for decision in names)] for label in names]
+    return ["label", *names], rows
 
 
 def _origin(record: ReleaseRecord) -> Rows:
@@ -243,18 +245,21 @@ def _origin(record: ReleaseRecord) -> Rows:
     columns = [column for column in CAPTION if column.title and column.name not in WITH_TABLE]
     rows: Rows = [[column.title, *pair] for column in columns for pair in numbers.of(column.name).items()]
     rows += [["values of the texts", name, count] for name, count in numbers.of("values").items()]
-    rows += [["captions read", f"{who.kind}: {who.model}", who.captions] for who in provenance.teachers]
+    rows += [["captions read", f"{teacher.kind}: {teacher.model}", teacher.captions] for teacher in provenance.teachers]
     rows += [["tokens", name.replace("_", " "), count] for name, count in provenance.tokens.items()]
     return [*rows, ["asks", "", provenance.asks]]
 
 
 def _text_lengths(numbers: Numbers) -> Rows:
+    if not numbers.of("flags")["has_caption"]:
+        return []
     rows = Rows()
-    for language in LANGUAGES if numbers.of("flags")["has_caption"] else ():
+    for language in LANGUAGES:
+        floors = MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS
         for name in FIELDS[:2]:  # the texts; the last field is the decision, a token
-            floor = (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS)[name]
             title = f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}"
-            rows.append([*_spread(title, numbers.spreads.get(f"caption_{language}_{name}", Spread())), floor])
+            spread = numbers.spreads.get(f"caption_{language}_{name}", Spread())
+            rows.append([*_spread(title, spread), floors[name]])
     return rows
 
 
@@ -267,11 +272,7 @@ STYLE = """
 
 
 def run(dataset: Path, out: Path) -> Path:
-    """Read the record of a release; write `stats.json` and `stats.html`, and return the page.
-
-    Raises:
-        InputError: If the folder is not a release.
-    """
+    """Read the record of a release (InputError if there is none); write `stats.json` and `stats.html`; return this."""
     record = read_record(release_folder(dataset) / RECORD)
     tables, runs = tables_of(record), [source.run for source in record.provenance.sources]
     write_json(out / "stats.json", {

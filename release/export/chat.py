@@ -36,7 +36,8 @@ DATASET_INFO = "dataset_info.json"  # where LLaMA-Factory looks up its data sets
 
 def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
     """Write the pictures that the samples show, and the samples, one file a split."""
-    skipped, counts = Counter[str](), dict[str, int]()  # counts: samples by file
+    skipped = Counter[str]()  # windows and texts that are no sample, by reason
+    counts: dict[str, int] = {}  # file -> samples
     for split, tracks in itertools.groupby(source.tracks(), lambda track: track.split):
         samples = (sample for track in tracks for sample in _samples(track, folder, cfg, skipped, advance))
         name = f"{split}.jsonl" if cfg.format == "chat" else f"{split}.json"
@@ -50,8 +51,8 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
     if cfg.format == "sharegpt":
         columns = {"messages": "conversations", "system": "system", "images": "images"}
         settings = {"formatting": "sharegpt", "columns": columns}
-        about = {f"cosfly_{Path(name).stem}": {"file_name": name, **settings} for name in counts}
-        write_bytes(folder / DATASET_INFO, (dump_json(about, indent=1) + "\n").encode())
+        data_sets = {f"cosfly_{Path(name).stem}": {"file_name": name, **settings} for name in counts}
+        write_bytes(folder / DATASET_INFO, (dump_json(data_sets, indent=1) + "\n").encode())
     return FormatFacts({"num_samples": sum(counts.values()), "skipped": reasons, "first_file": next(iter(counts))})
 
 
@@ -73,15 +74,18 @@ def _samples(
     track: SourceTrack, folder: Path, cfg: ExportConfig, skipped: Counter[str], advance: Advance
 ) -> list[dict[str, Any]]:
     """Return the samples of a track, and write their pictures; count by reason what cannot be a sample."""
-    rows, frame_indices = [row for row in track.rows if row["has_caption"]], set(track.frame_index)
-    samples = [sample for row in rows for sample in _samples_of(row, track, frame_indices, cfg, skipped)]
-    names = {name for sample in samples for name in sample["images"]}
+    captioned = [row for row in track.rows if row["has_caption"]]
+    frame_indices = set(track.frame_index)
+    samples = [sample for row in captioned for sample in _samples_of(row, track, frame_indices, cfg, skipped)]
+    if not samples:
+        return []  # no picture is read
+    shown = {name for sample in samples for name in sample["images"]}
     # The texts refer to pixels of the pictures that the teacher saw.
-    most_px = max((max(row[PICTURE_PX]) for row in rows if row[PICTURE_PX]), default=0)
+    most_px = max((max(row[PICTURE_PX]) for row in captioned if row[PICTURE_PX]), default=0)
     is_scaled = most_px < max(track.size_px)
-    for row, pictures in track.frames() if names else ():  # without samples no picture is read
+    for row, pictures in track.frames():
         name, data = _picture_name(track, row["frame_index"]), pictures["rgb"]
-        if name in names:
+        if name in shown:
             if is_scaled:
                 data = colours_png(frame_views.bounded(colours_of(data, row["sample_id"]), most_px))
             write_bytes(folder / name, data)
@@ -111,8 +115,9 @@ def _samples_of(
             skipped[f"no text or question in {language}"] += 1
             continue
         size_px = tuple(row[PICTURE_PX])
-        all_frames = frame_views.Pictures(("rgb",), size_px)
-        sentence = LAST_FRAME_SENTENCE[language].format(*size_px) if is_last else all_frames.sentence(language)
+        sentence = frame_views.Pictures(("rgb",), size_px).sentence(language)
+        if is_last:
+            sentence = LAST_FRAME_SENTENCE[language].format(*size_px)
         prompt, reply = Prompt(system=system, user=user).told(sentence), dump_json(answer)
         if any(mark in text for mark in MARKS for text in (prompt.system, prompt.user, reply)):
             skipped["a text with a mark for pictures"] += 1  # a loader would look for one more

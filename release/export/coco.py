@@ -30,7 +30,7 @@ CATEGORIES = [
     {"id": TARGET, "name": "target", "supercategory": "person"},
     {"id": OTHER, "name": "other person", "supercategory": "person"},
 ]
-IDS = 1 << 16  # of instances in a picture; the id of an annotation is that of its picture times this, plus its instance
+MOST_IDS = 1 << 16  # of instances in a picture; the id of an annotation is picture id * MOST_IDS + instance id
 
 
 def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
@@ -40,25 +40,29 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
         "info": {"description": record.name, "contributor": record.credits, "version": record.content_digest},
         "licenses": [{"id": 1, "name": record.licence, "url": ""}], "categories": CATEGORIES,
     }  # fmt: skip
-    ids, num_people, used = itertools.count(1), 0, list[SplitName]()
+    image_ids = itertools.count(1)
+    num_people = 0
+    splits: list[SplitName] = []
     for split, tracks in itertools.groupby(source.tracks(), lambda track: track.split):
-        used.append(split)
+        splits.append(split)
         path = folder / f"annotations/instances_{split}.json"
-        with atomic_file(path) as file, tempfile.TemporaryFile(dir=folder) as people:
+        # The annotations follow all images in the file, so that they are kept in another one until then.
+        with atomic_file(path) as file, tempfile.TemporaryFile(dir=folder) as annotations_file:
             file.write(dump_json(about)[:-1].encode() + b',"images":[')
             frames = ((track.name, *frame) for track in tracks for frame in track.frames())
             for number, (name, row, pictures) in enumerate(frames):
-                image, annotations = _annotate(name, row, pictures, next(ids), folder / split)
+                image, annotations = _annotate(name, row, pictures, next(image_ids), folder / split)
                 file.write((b",\n" if number else b"") + dump_json(image).encode())
                 for annotation in annotations:
-                    people.write((b",\n" if people.tell() else b"") + dump_json(annotation).encode())
+                    separator = b",\n" if annotations_file.tell() else b""
+                    annotations_file.write(separator + dump_json(annotation).encode())
                 num_people += len(annotations)
                 advance(1)
             file.write(b'],\n"annotations":[')
-            people.seek(0)
-            shutil.copyfileobj(people, file)
+            annotations_file.seek(0)
+            shutil.copyfileobj(annotations_file, file)
             file.write(b"]}\n")
-    return FormatFacts({"num_people": num_people, "first_split": used[0]})
+    return FormatFacts({"num_people": num_people, "first_split": splits[0]})
 
 
 def _annotate(
@@ -77,38 +81,42 @@ def _annotate(
 
 def people_in(row: Row, instances: np.ndarray, image_id: int) -> Iterator[dict[str, Any]]:
     """Yield the annotation of each person with a pixel in the instance picture of a row, (h, w, 3) uint8."""
-    red, green, blue = np.moveaxis(instances, 2, 0)
-    is_person, ids = red == KINDS["Pedestrians"], green | blue.astype(np.uint16) << 8
+    kind, low, high = np.moveaxis(instances, 2, 0)
+    is_person = kind == KINDS["Pedestrians"]
+    ids = low | high.astype(np.uint16) << 8
     people = np.unique(ids[is_person]).tolist()
     target = PERSON_ID if PERSON_ID in people else _most_in_box(np.where(is_person, ids.astype(np.int64), -1), row)
     for person in people:
         mask = is_person & (ids == person)
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         x, y = int(columns[0]), int(rows[0])
-        category = TARGET if person == target else OTHER
-        found = {
-            "id": image_id * IDS + person, "image_id": image_id, "category_id": category,
+        annotation = {
+            "id": image_id * MOST_IDS + person, "image_id": image_id,
+            "category_id": TARGET if person == target else OTHER,
             "bbox": [x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1], "area": int(mask.sum()), "iscrowd": 0,
             "segmentation": {"size": list(mask.shape), "counts": run_lengths(mask)}, "instance_id": person,
         }  # fmt: skip
-        yield found | ({"visibility": row["visibility"]} if category == TARGET else {})
+        if person == target:
+            annotation["visibility"] = row["visibility"]
+        yield annotation
 
 
 def _most_in_box(ids: np.ndarray, row: Row) -> int | None:
-    """Return the person with most pixels in the box of the target. Only pictures of others need the projected box:
-    cosfly's have the id PERSON_ID, and record the outcome of perturbations in each frame."""
-    box = row["target_mask_bbox"] or (row["target_bbox"] if row["perturbation"] is None else None)
+    """Return the person with most pixels in the box of the target; `ids`, (h, w) int64, are -1 outside of people."""
+    box = row["target_mask_bbox"]
+    if box is None and row["perturbation"] is None:  # not of cosfly, whose targets have PERSON_ID in the picture
+        box = row["target_bbox"]
     if box is None:
         return None
     xmin, ymin, xmax, ymax = (max(0, round(box[name])) for name in BOX)
-    found, counts = np.unique(ids[ymin:ymax, xmin:xmax], return_counts=True)
-    counts[found < 0] = 0
-    return int(found[counts.argmax()]) if counts.any() else None
+    people, counts = np.unique(ids[ymin:ymax, xmin:xmax], return_counts=True)
+    counts[people < 0] = 0
+    return int(people[counts.argmax()]) if counts.any() else None
 
 
 def run_lengths(mask: np.ndarray) -> list[int]:
     """Return the lengths of the runs of a mask by columns; the first run is outside the mask, perhaps of length 0."""
     flat = mask.ravel(order="F")
     edges = np.flatnonzero(flat[1:] != flat[:-1]) + 1
-    starts = [0, *([0] if flat[0] else []), *edges.tolist(), len(flat)]
-    return np.diff(starts).tolist()
+    begin = [0, 0] if flat[0] else [0]
+    return np.diff([*begin, *edges.tolist(), len(flat)]).tolist()

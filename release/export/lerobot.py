@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -71,9 +71,8 @@ def features_of(modalities: Sequence[FrameFile], size_px: tuple[int, int], fps: 
     width, height = size_px
     features: dict[str, dict[str, Any]] = {}
     for file in modalities:
-        camera: dict[str, Any] = {
-            "dtype": "image", "shape": [height, width, 3], "names": ["height", "width", "channels"],
-        }  # fmt: skip
+        shape, names = [height, width, 3], ["height", "width", "channels"]
+        camera: dict[str, Any] = {"dtype": "image", "shape": shape, "names": names}
         if file == "depth":
             camera |= {"shape": [height, width, 1], "info": {"is_depth_map": True, "depth_unit": "m"}}
         elif video:
@@ -131,13 +130,10 @@ def values_of(rows: list[Row], episode: int, first: int, fps: int, tasks: Sequen
     values |= {name: [row[name] or "" for row in rows] for name in TEXTS}
     frames = np.arange(n, dtype=np.int64)
     return values | {
-        "next.done": frames == n - 1,
-        "frame_index": frames,
-        "timestamp": (frames / fps).astype(np.float32),
-        "episode_index": np.full(n, episode, dtype=np.int64),
-        "index": first + frames,
+        "next.done": frames == n - 1, "frame_index": frames, "timestamp": (frames / fps).astype(np.float32),
+        "episode_index": np.full(n, episode, dtype=np.int64), "index": first + frames,
         "task_index": np.array(tasks, dtype=np.int64),
-    }
+    }  # fmt: skip
 
 
 def task_of(goal: str, decision: str) -> str:
@@ -184,8 +180,7 @@ def merged(summaries: Sequence[Summary]) -> Summary:
 
 
 def _merge_all(stats: Sequence[dict[str, Summary]]) -> dict[str, Summary]:
-    """Merge the summaries of each feature."""
-    return {name: merged([summaries[name] for summaries in stats]) for name in stats[0]}
+    return {name: merged([by_feature[name] for by_feature in stats]) for name in stats[0]}
 
 
 # --- the export -------------------------------------------------------------------------------------------------------
@@ -204,6 +199,16 @@ class Layout:
     @property
     def place(self) -> dict[str, int]:
         return {"chunk_index": self.file // CHUNK, "file_index": self.file % CHUNK}
+
+
+class DataFile(NamedTuple):
+    """A data file that is being written, with the videos that belong to it."""
+
+    layout: Layout
+    features: dict[str, Any]
+    tasks: dict[str, int]  # task -> number
+    table: pq.ParquetWriter
+    videos: dict[str, Callable[[np.ndarray], None]]  # camera -> function that adds a picture
 
 
 def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
@@ -227,13 +232,11 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
         episodes_of_split[split] += len(rows)
         episode, index = layout.episode + len(rows), rows[-1]["dataset_to_index"]
         layout = replace(layout, file=layout.file + 1, episode=episode, index=index)
-    ends = itertools.accumulate(episodes_of_split.values())
+    ends = dict(zip(episodes_of_split, itertools.accumulate(episodes_of_split.values()), strict=True))
     info = {
         "codebase_version": VERSION, "robot_type": "cosfly_drone", "total_episodes": layout.episode,
         "total_frames": layout.index, "total_tasks": len(tasks), "chunks_size": CHUNK, "fps": layout.fps,
-        "splits": {
-            split: f"{end - count}:{end}" for (split, count), end in zip(episodes_of_split.items(), ends, strict=True)
-        },
+        "splits": {split: f"{end - episodes_of_split[split]}:{end}" for split, end in ends.items()},
         "data_path": DATA_PATH, "video_path": VIDEO_PATH if cfg.video else None, "features": features,
         "data_files_size_in_mb": cfg.shard_mb, "video_files_size_in_mb": cfg.shard_mb,
     }  # fmt: skip
@@ -297,8 +300,9 @@ def _write_file(
         table = stack.enter_context(pq.ParquetWriter(file, schema, **options))
         paths = {name: folder / VIDEO_PATH.format(video_key=name, **layout.place) for name in cameras}
         videos = {name: stack.enter_context(video_writer(path, layout)) for name, path in paths.items()}
+        data_file = DataFile(layout, features, tasks, table, videos)
         for number, episode in enumerate(episodes, layout.episode):
-            rows.append(_write_episode(source, episode, number, first, layout, features, tasks, table, videos, advance))
+            rows.append(_write_episode(source, episode, number, first, data_file, advance))
             first += len(episode)
     buffer = io.BytesIO()
     pq.write_table(pa.Table.from_pylist([_flat_row(row, layout, cameras) for row in rows]), buffer)
@@ -322,39 +326,37 @@ def video_writer(path: Path, layout: Layout) -> Iterator[Callable[[np.ndarray], 
 
 
 def _write_episode(
-    source: ExportSource, track: SourceTrack, number: int, first: int, layout: Layout, features: dict[str, Any],
-    task_numbers: dict[str, int], table: pq.ParquetWriter, videos: dict[str, Callable[[np.ndarray], None]],
-    advance: Advance,
-) -> dict[str, Any]:  # fmt: skip
-    """Write the rows and pictures of an episode, of this number and first frame; return its row of the table of
-    episodes."""
+    source: ExportSource, track: SourceTrack, number: int, first: int, file: DataFile, advance: Advance
+) -> dict[str, Any]:
+    """Write the rows and pictures of an episode; return its row of the table of episodes."""
+    layout, table, videos = file.layout, file.table, file.videos
     if track.size_px != layout.size_px:
         problem, fix = "the lerobot export needs pictures of one size", "build one release for each size"
         got, expected = ("{} x {} px".format(*size) for size in (track.size_px, layout.size_px))
         raise InputError(problem, where=track.name, got=got, expected=expected, fix=fix)
     n = len(track)
     tasks = [task_of(row["goal_en"] or "", row["decision"] or "") for row in track.rows]
-    values = values_of(track.rows, number, first, layout.fps, [task_numbers[task] for task in tasks])
-    pixels: dict[str, list[np.ndarray]] = {CAMERAS[file]: [] for file in source.modalities}  # for the statistics
-    sampled = {int(i) for i in np.linspace(0, n - 1, min(n, SAMPLED_FRAMES)).round()}
+    values = values_of(track.rows, number, first, layout.fps, [file.tasks[task] for task in tasks])
+    sampled = {int(i) for i in np.linspace(0, n - 1, min(n, SAMPLED_FRAMES)).round()}  # frames whose pixels count
+    pixels: dict[str, list[np.ndarray]] = {CAMERAS[modality]: [] for modality in source.modalities}
     frames = track.frames()
     for start in range(0, n, ROWS_HELD):
         images: dict[str, list[Any]] = {name: [] for name in pixels}
         for i, (row, pictures) in enumerate(itertools.islice(frames, ROWS_HELD), start):
-            for file in source.modalities:
-                name, data = CAMERAS[file], pictures[file]
+            for modality in source.modalities:
+                name, data = CAMERAS[modality], pictures[modality]
                 if name in videos:
                     videos[name](colours_of(data, row["sample_id"]))
                 else:
-                    images[name].append(_image(data, row["sample_id"], file))
+                    images[name].append(_image(data, row["sample_id"], modality))
                 if i in sampled:
-                    pixels[name].append(_pixels(data, row["sample_id"], file))
+                    pixels[name].append(_pixels(data, row["sample_id"], modality))
             advance(1)
         part = slice(start, start + ROWS_HELD)
         columns = {name: images.get(name) or list(values[name][part]) for name in table.schema.names}
         table.write_table(pa.Table.from_pydict(columns, schema=table.schema))
     stats = {name: summarize(np.concatenate(parts), len(parts), is_picture=True) for name, parts in pixels.items()}
-    for name, feature in features.items():
+    for name, feature in file.features.items():
         if name not in pixels and feature["dtype"] != "string":
             stats[name] = summarize(np.asarray(values[name], dtype=np.float64).reshape(n, -1), n)
     return {

@@ -191,15 +191,8 @@ def key_of(sample_id: str) -> str:
 
 
 def open_release(folder: Path, consecutive: str = "") -> ExportSource:
-    """Open a release, or that of a run.
-
-    Args:
-        consecutive: What needs consecutive frames, if something does.
-
-    Raises:
-        InputError: If the folder has no release, if the release is incomplete or lacks consecutive frames that are
-            needed.
-    """
+    """Open a release, or that of a run; InputError if there is none or it is incomplete. `consecutive` names, for the
+    message, what needs consecutive frames; then InputError if the release has skipped some."""
     folder = release_folder(folder)
     record = read_record(folder / RECORD)
     if consecutive:
@@ -244,8 +237,7 @@ class _ShardNames:
 
 
 def shards(pieces: Iterable[SourceTrack], shard_mb: int) -> Iterator[tuple[str, Iterator[SourceTrack]]]:
-    """Group pieces of each split into files of about `shard_mb`; yield the name of each and its pieces, which are read
-    before the next file."""
+    """Group pieces of each split into files of about `shard_mb`; yield names and pieces, to be read in order."""
     return itertools.groupby(pieces, _ShardNames(shard_mb).next_name)
 
 

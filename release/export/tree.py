@@ -35,27 +35,28 @@ from release.reading import Row, TrackRows
 
 def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
     """Write each track, and each town's `map.json`; count the tracks of which strict readers will miss something."""
-    has_runs = len({one.flight.partition("/")[0] for one in source.record.flights}) > 1
-    maps = {entry.town: entry for entry in source.record.maps}
-    groups = Counter[tuple[str, str, str]]()
+    has_several_runs = len({track.flight.partition("/")[0] for track in source.record.flights}) > 1
+    maps = {released_map.town: released_map for released_map in source.record.maps}
+    numbers = dict[tuple[str, str, str], int]()  # run, town, trajectory -> number of the trajectory in the export
+    num_tracks = Counter[int]()  # of each trajectory
     num_gaps = 0
     for track in source.tracks():
-        at = track.place
-        if not at.town.startswith(TOWN) or not at.trajectory.startswith("trajectory_"):
+        run, town, trajectory = track.place.run, track.place.town, track.place.trajectory
+        if not town.startswith(TOWN) or not trajectory.startswith("trajectory_"):
             what, expected = "a playback tree cannot contain a track of this name", f"{TOWN}*/trajectory_*"
             raise InputError(what, where=source.folder, got=track.name, expected=expected, fix="export another format")
-        group = (at.run, at.town, at.trajectory)
-        groups[group] += 1
-        number, place = list(groups).index(group), folder / (at.run if has_runs else "") / at.town
+        number = numbers.setdefault((run, town, trajectory), len(numbers))
+        num_tracks[number] += 1
         num_gaps += bool((np.diff(track.frame_index) != 1).any() or track.frame_index[0] != 0)
-        _write_track(track, number, place / at.trajectory / at.variant, advance)
-        shown = maps.get(at.town)
-        about = TownMap(name=shown.name, licence=shown.licence, credits=shown.credits) if shown else None
-        about = about or TownMap(name=at.town, licence=UNKNOWN_LICENCE, credits="")
-        write_model(place / TOWN_FILE, about, TOWN_FORMAT)
+        town_folder = folder / (run if has_several_runs else "") / town
+        _write_track(track, number, town_folder / trajectory / track.place.variant, advance)
+        town_map = TownMap(name=town, licence=UNKNOWN_LICENCE, credits="")
+        if released_map := maps.get(town):
+            town_map = TownMap(**released_map.model_dump(include={"name", "licence", "credits"}))
+        write_model(town_folder / TOWN_FILE, town_map, TOWN_FORMAT)
     values = {
-        "num_gaps": num_gaps, "num_tracks": groups.total(), "num_trajectories": len(groups),
-        "num_alone": sum(count < 2 for count in groups.values()),
+        "num_gaps": num_gaps, "num_tracks": num_tracks.total(), "num_trajectories": len(numbers),
+        "num_alone": sum(count < 2 for count in num_tracks.values()),
     }  # fmt: skip
     return FormatFacts(values, COORDINATES)
 
@@ -82,31 +83,30 @@ def _write_track(track: SourceTrack, number: int, out: Path, advance: Advance) -
 # --- trajectory.json --------------------------------------------------------------------------------------------------
 
 
-def track_of_rows(placed: SourceTrack, number: int) -> Track:
+def track_of_rows(exported: SourceTrack, number: int) -> Track:
     """Return the track of released rows; `number` is that of its trajectory in the export."""
-    rows = placed.rows
-    found = TrackRows(placed.name, rows)
+    rows, place = TrackRows(exported.name, exported.rows), exported.place
+    first = exported.rows[0]
+    source = {
+        "path_index": number, "scenario_id": number,
+        "scenario_name": f"{place.run}/{place.town}/{place.trajectory}".lstrip("/"),
+        "algorithm": first["planner"] or "unknown", "released_frames": exported.frame_index,
+        **pace_field(first["pace"]),
+    }  # fmt: skip
+    points = [_point(row) for row in exported.rows]
     return replace(
-        found.track,
-        intrinsics=None if (found.intrinsics == found.intrinsics[0]).all() else matrices_of(found.intrinsics),
-        segments=_segments([row["style"] for row in rows]),
-        source={
-            "path_index": number,
-            "scenario_id": number,
-            "scenario_name": f"{placed.place.run}/{placed.place.town}/{placed.place.trajectory}".lstrip("/"),
-            "algorithm": rows[0]["planner"] or "unknown",
-            "released_frames": placed.frame_index,
-            **pace_field(rows[0]["pace"]),
-        },
-        goal=_goal(found, placed),
-        raw={"dataset_format": "v7", "made_by": DATASET_FORMAT, "points": [*map(_point, rows)], **_weather(rows[0])},
-    )
+        rows.track, source=source, goal=_goal(rows.goal, exported.frame_index),
+        intrinsics=None if (rows.intrinsics == rows.intrinsics[0]).all() else matrices_of(rows.intrinsics),
+        segments=_segments([row["style"] for row in exported.rows]),
+        raw={"dataset_format": "v7", "made_by": DATASET_FORMAT, "points": points, **_weather(first)},
+    )  # fmt: skip
 
 
-def _goal(rows: TrackRows, placed: SourceTrack) -> Goal | None:
+def _goal(goal: Goal | None, frame_index: list[int]) -> Goal | None:
     """Return the goal if its frame is released, with the number of that frame in the tree."""
-    at = np.flatnonzero(np.equal(placed.frame_index, rows.goal.frame if rows.goal else -1))
-    return replace(rows.goal, frame=int(at[0])) if rows.goal and len(at) else None
+    if goal is None or goal.frame not in frame_index:
+        return None
+    return replace(goal, frame=frame_index.index(goal.frame))
 
 
 def _point(row: Row) -> dict[str, Any]:
@@ -115,22 +115,25 @@ def _point(row: Row) -> dict[str, Any]:
     outcome = {name: text for name, text in (row["perturbation"] or {}).items() if text is not None}
     if row["is_perturbed"] and row["drone_offset"] is None:
         outcome |= {"drone_position": True, "drone_rotation": True}
-    target = {name: value for name in LEGIBILITY if (value := row[f"target_{name}"]) is not None}
-    others = dict(zip(BYSTANDER_COLUMNS, (row[name] for name in COMPANY_COLUMNS), strict=True))
-    point = {"perturbation": outcome, "target": target, "others": others if others["in_view"] is not None else {}}
-    return {name: one for name, one in point.items() if one}
+    target = {name: row[f"target_{name}"] for name in LEGIBILITY if row[f"target_{name}"] is not None}
+    others = {}
+    if row["others_in_view"] is not None:
+        others = dict(zip(BYSTANDER_COLUMNS, (row[name] for name in COMPANY_COLUMNS), strict=True))
+    point = {"perturbation": outcome, "target": target, "others": others}
+    return {name: value for name, value in point.items() if value}
 
 
 def _weather(row: Row) -> dict[str, Any]:
+    """Return the field of the weather: with its parameters, or else its names, or nothing if they are null."""
     if row["weather_params"] is not None and row["weather_mode"] is not None:
         names = {"weather_name": row["weather"], "tod_name": row["time_of_day"]}
         return {"weather": {"mode": row["weather_mode"], **names, "params": row["weather_params"]}}
-    told = {name: row[name] for name in ("weather", "time_of_day") if row[name] is not None}
-    return {"weather": told} if told else {}
+    names = {name: row[name] for name in ("weather", "time_of_day") if row[name] is not None}
+    return {"weather": names} if names else {}
 
 
 def _segments(styles: list[str]) -> tuple[Segment, ...]:
-    """Return the parts of a track by style; none where it follows from end to end."""
+    """Return the parts of a track by style; none if it follows from end to end."""
     if set(styles) == {FOLLOW}:
         return ()
     parts, begin = [], 0

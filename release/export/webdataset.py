@@ -30,12 +30,10 @@ MOST_FRAMES = 100  # of a piece, the smallest part of a shard
 
 def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
     """Cut each split into shards of about `shard_mb`, and write them."""
-    pieces = (
-        piece for track in source.tracks() for piece in track.cut([*range(0, len(track), MOST_FRAMES), len(track)])
-    )
-    counts = Counter[str]()
-    for name, own in shards(pieces, cfg.shard_mb):
-        _write_shard(folder / f"{name}.tar", own, advance)
+    pieces = (part for track in source.tracks() for part in track.cut([*range(0, len(track), MOST_FRAMES), len(track)]))
+    counts = Counter[str]()  # split -> shards
+    for name, pieces_of_shard in shards(pieces, cfg.shard_mb):
+        _write_shard(folder / f"{name}.tar", pieces_of_shard, advance)
         counts[name.rpartition("-")[0]] += 1
     first = next(iter(counts))
     last = counts[first] - 1
@@ -57,20 +55,20 @@ def _write_shard(path: Path, pieces: Iterator[SourceTrack], advance: Advance) ->
 
 def members(row: Row) -> Iterator[tuple[str, bytes]]:
     """Yield the files of one frame by their endings, but for its pictures."""
-    together = {}
+    in_json = {}
     for column in SCALARS:
         if column.name == TARGET_PICTURE:
             continue
         value = row[column.name]
         if column.type in TEXTS:
-            together[column.name] = _text(value)
+            in_json[column.name] = _text(value)
         elif (column.required and not column.of_caption) or column.name == "has_caption":
-            together[column.name] = value
+            in_json[column.name] = value
         else:
             buffer = BytesIO()
             np.save(buffer, _numbers(column, value))
             yield f"{column.name}.npy", buffer.getvalue()
-    yield "json", (dump_json(together) + "\n").encode()
+    yield "json", (dump_json(in_json) + "\n").encode()
 
 
 def _text(value: object) -> str:

@@ -11,8 +11,7 @@ from release.verify.findings import Findings
 
 
 def check_captions(track: TrackRows, window_frames: int, findings: Findings) -> None:
-    """Check that captions are whole or null, that their windows have `window_frames` frames, and that the verdict fits
-    label and decision."""
+    """Check that captions are whole or null, the length of their windows, and verdict against label and decision."""
     for i, row in enumerate(track.rows):
         has_caption, decision = row["has_caption"], row["decision"]
         if wrong := _wrong_columns(row):
@@ -42,13 +41,7 @@ def _wrong_columns(row: Row) -> list[str]:
 def released_track(
     frames: TrackRows, points: TrackRows, clean: TrackRows | None, settings: dict[str, Any]
 ) -> ReleasedTrack:
-    """Return what a reader of captions needs of a track.
-
-    Args:
-        points: All points of the track.
-        clean: All points of its clean track, if it is perturbed and that is released; not used if it has other frames.
-        settings: Of the captions, as the record has them.
-    """
+    """Return what a reader of captions needs: all points of a track, and of its clean one if it has the same frames."""
     captions = [shown_caption(row) for row in frames.rows if row.get("has_caption")]
     twin = None
     if clean is not None and len(clean) == len(points):
@@ -57,8 +50,7 @@ def released_track(
 
 
 def shown_caption(row: Row) -> ShownCaption:
-    """Return the caption of a row. Raises KeyError and TypeError if a part of it is missing, which `check_captions`
-    reports."""
+    """Return the caption of a row; KeyError or TypeError if a part is missing, which `check_captions` reports."""
     return ShownCaption(
         sample_id=row["sample_id"], frame_index=row["frame_index"], window=row[WINDOW] or [],
         picture_px=tuple(row[PICTURE_PX]),

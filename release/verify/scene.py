@@ -181,7 +181,7 @@ def _check_target_picture(track: TrackRows, i: int, data: bytes, rgb: bytes | me
 # --- a track ----------------------------------------------------------------------------------------------------------
 
 
-class Pair(NamedTuple):
+class FramePair(NamedTuple):
     """Two neighbouring frames of a track."""
 
     row: int  # of the later one
@@ -191,7 +191,7 @@ class Pair(NamedTuple):
 
 def check_pictures(track: TrackRows, pictures: Iterator[Pictures], findings: Findings) -> None:
     """Check all pictures of a track, one after the other; memory holds two frames."""
-    pairs: list[Pair] = []
+    pairs: list[FramePair] = []
     kinds = np.full(NUM_IDS, -1, np.int64)  # of the instances that were seen
     steps: list[float] = []
     previous: tuple[int, View] | None = None  # the row before, if it can be compared
@@ -209,7 +209,7 @@ def check_pictures(track: TrackRows, pictures: Iterator[Pictures], findings: Fin
         if decoded.depth.size and previous is not None:
             k, view_before = previous
             agreement = compare_views(view_before, view, track.intrinsics[k], track.intrinsics[i])
-            pairs.append(Pair(i, int(track.index[i] - track.index[k]), agreement))
+            pairs.append(FramePair(i, int(track.index[i] - track.index[k]), agreement))
         if decoded.depth.size:
             steps += _step_of(decoded.depth)
         previous = (i, view)
@@ -245,7 +245,7 @@ def _check_kinds(track: TrackRows, i: int, instance: np.ndarray, kinds: np.ndarr
         kinds[instance_id] = new_kind
 
 
-def _judge_pairs(track: TrackRows, pairs: list[Pair], rounding: float, findings: Findings) -> None:
+def _judge_pairs(track: TrackRows, pairs: list[FramePair], rounding: float, findings: Findings) -> None:
     """Report depth that is scaled or shifted, whose planes move with the camera, and pairs of frames that do not show
     one world. rounding: error of two rounded depths, as a share."""
     for what, most, errors in (
@@ -262,7 +262,7 @@ def _judge_pairs(track: TrackRows, pairs: list[Pair], rounding: float, findings:
             _judge_pair(track, pair, ERROR_MOST + rounding, findings)
 
 
-def _judge_pair(track: TrackRows, pair: Pair, error_most: float, findings: Findings) -> None:
+def _judge_pair(track: TrackRows, pair: FramePair, error_most: float, findings: Findings) -> None:
     """Report two frames whose depths, or else whose instances, do not show one world."""
     seen, where = pair.agreement, track.where(pair.row)
     has_gone = pair.gap <= NEAR_FRAMES and seen.missing_share > GONE_MOST

@@ -184,9 +184,9 @@ def _check_number(
 def check_points(track: TrackRows, points: TrackRows, findings: Findings) -> None:
     """Check ids, that a track has all of its points in time, and that each row has the values of its point."""
     for i, row in enumerate(track.rows):
-        found, expected = row["sample_id"], f"{track.given_id}_frame_{row['frame_index'] or 0:05d}"
-        if track.given_id is not None and found != expected:
-            findings.error("sample_id", track.where(i, "sample_id"), repr(found), f"{expected}, by its track")
+        sample_id, expected = row["sample_id"], f"{track.given_id}_frame_{row['frame_index'] or 0:05d}"
+        if track.given_id is not None and sample_id != expected:
+            findings.error("sample_id", track.where(i, "sample_id"), repr(sample_id), f"{expected}, by its track")
     if (points.time_s[1:] <= points.time_s[:-1]).any():
         findings.error("time", points.where(0, "time_s"), "times that do not increase", "increasing times")
     if not np.array_equal(points.index, np.arange(len(points))):

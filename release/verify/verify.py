@@ -102,8 +102,7 @@ def _check_shards(
 
 
 def check_names(folder: Path, record: ReleaseRecord, findings: Findings) -> set[str]:
-    """Compare the files of the folder with those of the record; return the names of those with the right size. No link
-    to a folder is followed."""
+    """Compare the files with those of the record, following no link to a folder; return those of the right size."""
     expected: dict[str, int | None] = dict.fromkeys((*RECORDS, CHECKSUMS))  # name -> size, None: any
     expected |= {file.path: file.bytes for file in record.files}
     sizes = dict[str, int]()
@@ -209,7 +208,7 @@ def check_record(record: ReleaseRecord, findings: Findings) -> None:
         "captions of splits": (sum(by_split.values()), num_captions),
         "maps": ({town_map.town for town_map in record.maps} >= {*record.numbers.counts.get("town", ())}, True),
         "rule of splits": (stated.rule, SPLIT_RULE),
-    }
+    }  # fmt: skip
     for name, (got, expected) in values.items():
         findings.compare("record", f"{RECORD}: {name}", got, expected)
     shares = stated.fractions

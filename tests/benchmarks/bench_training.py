@@ -122,7 +122,7 @@ def make_rows(shape: str, count: int, seed: int) -> list[tuple[EncodedSample, li
 
 
 def noise_of(picture: FramePicture, dtype: Any) -> Tensors:
-    width_px, height_px = picture.picture.size_px
+    width_px, height_px = picture.view.size_px
     values = np.random.default_rng(int(picture.frame)).standard_normal((height_px * width_px // 256, 1536), np.float32)
     grid = torch.tensor([[1, height_px // 16, width_px // 16]])
     return {"pixel_values": torch.from_numpy(values).to(dtype), "image_grid_thw": grid}
