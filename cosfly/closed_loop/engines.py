@@ -204,15 +204,12 @@ class PromptedEngine:
         place = script.town, script.trajectory, script.variant
         height_px, width_px, _ = moments[-1].frame.rgb.shape
         window = ObservedWindow(
-            sample_id(f"{script.trajectory}_{script.variant}", moments[-1].index),
-            *place,
-            indices=tuple(moment.index for moment in moments),
-            width_px=width_px,
-            height_px=height_px,
+            sample_id(f"{script.trajectory}_{script.variant}", moments[-1].index), *place,
+            indices=tuple(moment.index for moment in moments), width_px=width_px, height_px=height_px,
             frames=tuple(map(_observed, moments)),
             frame_folders=tuple(self._folder(place, moment) for moment in moments),
             frame_files=(frozenset(FILE_NAMES.values()),) * len(moments),
-        )
+        )  # fmt: skip
         return make_question(window, self.caption_cfg.image, self.caption_cfg.writing, self.vocabulary)
 
     def _folder(self, place: tuple[str, str, str], moment: Moment) -> Path:

@@ -139,14 +139,11 @@ def _fly_plan(simulation: ClosedLoopTrajectory, **fields: Any) -> DroneTrace | N
         return None
     poses = simulation.poses
     return flown_trace(
-        simulation.airspace.surroundings.obstacles,
-        time_s=np.array([moment.time_s for moment in moments]),
-        poses=np.hstack([poses.positions_m, poses.rotations_deg]),
-        targets_m=poses.targets_m,
+        simulation.airspace.surroundings.obstacles, time_s=np.array([moment.time_s for moment in moments]),
+        poses=np.hstack([poses.positions_m, poses.rotations_deg]), targets_m=poses.targets_m,
         clearances_m=poses.clearances_m,
-        ground_m=np.array([moment.position_m[2] - moment.height_m for moment in moments]),
-        **fields,
-    )
+        ground_m=np.array([moment.position_m[2] - moment.height_m for moment in moments]), **fields,
+    )  # fmt: skip
 
 
 def _planned_on(plan: DroneTrace, flown: Sequence[EpisodeFrame], airspace: Airspace, cfg: PlanConfig) -> DroneTrace:

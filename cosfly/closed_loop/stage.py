@@ -312,17 +312,12 @@ def trace_of(record: Episode, obstacles: BoxIndex) -> DroneTrace:
     """Return a flown episode as a drone trajectory, for `render` and `inspect`."""
     frames = record.frames
     return flown_trace(
-        obstacles,
-        time_s=np.array([frame.time_s for frame in frames]),
-        poses=np.array([frame.pose for frame in frames]),
-        targets_m=np.array([frame.target_m for frame in frames]),
+        obstacles, time_s=np.array([frame.time_s for frame in frames]),
+        poses=np.array([frame.pose for frame in frames]), targets_m=np.array([frame.target_m for frame in frames]),
         clearances_m=np.array([frame.clearance_m for frame in frames]),
-        ground_m=np.array([frame.pose[2] - frame.height_m for frame in frames]),
-        path_id=record.walk,
-        planner=f"flown by {record.student}",
-        solver={"ended": record.ended},
-        pace=record.pace,
-    )
+        ground_m=np.array([frame.pose[2] - frame.height_m for frame in frames]), path_id=record.walk,
+        planner=f"flown by {record.student}", solver={"ended": record.ended}, pace=record.pace,
+    )  # fmt: skip
 
 
 def flown_trace(

@@ -240,15 +240,9 @@ class ClosedLoopTrajectory:
         target_m = poses.targets_m[i].copy()
         people = script.bystanders.people(script.clothes.looks) if self.airspace.renderer.dresses else None
         return Moment(
-            index=i,
-            time_s=float(script.trace.time_s[i]),
-            position_m=position_m,
-            rotation_deg=poses.rotations_deg[i].copy(),
-            velocity_mps=velocity_mps,
-            target_m=target_m,
+            index=i, time_s=float(script.trace.time_s[i]), position_m=position_m,
+            rotation_deg=poses.rotations_deg[i].copy(), velocity_mps=velocity_mps, target_m=target_m,
             target=written_target(drawn.target, drawn.frame),
             bystanders={} if drawn.bystanders is None else drawn.bystanders.people_of(target_m, people),
-            frame=drawn.frame,
-            clearance_m=clearance_m,
-            height_m=float(position_m[2] - (target_m[2] - TARGET_HEIGHT_M)),
-        )
+            frame=drawn.frame, clearance_m=clearance_m, height_m=float(position_m[2] - (target_m[2] - TARGET_HEIGHT_M)),
+        )  # fmt: skip

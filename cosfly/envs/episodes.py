@@ -145,14 +145,10 @@ def world_of(town: BenchmarkTown) -> BenchmarkWorld:
     boxes = load(SyntheticConfig(name=town.name, preset=town.preset), town.seed)
     simplified = simplify(boxes, SimplifyConfig())
     return BenchmarkWorld(
-        town=town,
-        boxes=boxes,
-        simplified=simplified,
-        ground=walkable_ground(simplified, _ALONE, where=town.name),
-        obstacles=obstacle_index(simplified),
-        screens=screens_of(simplified),
+        town=town, boxes=boxes, simplified=simplified, ground=walkable_ground(simplified, _ALONE, where=town.name),
+        obstacles=obstacle_index(simplified), screens=screens_of(simplified),
         solids=obstacle_index(boxes.select(~boxes.is_any_of({KINDS["Vegetation"]}))),
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -353,14 +353,9 @@ def _check_depth(depth: np.ndarray, where: str, numbers: FrameNumbers, report: R
 
 
 def _check_mask(
-    track: Track,
-    i: int,
-    picture: Picture,
-    figures: PixelFigures,
-    is_bystander: np.ndarray,
-    numbers: FrameNumbers,
+    track: Track, i: int, picture: Picture, figures: PixelFigures, is_bystander: np.ndarray, numbers: FrameNumbers,
     report: Report,
-) -> None:
+) -> None:  # fmt: skip
     """Compare pedestrian pixels with the target's projected and recorded box, and with its depth."""
     box = target_box(track, i)
     visibility = track.target.visibility[i]

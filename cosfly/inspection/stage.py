@@ -56,15 +56,9 @@ def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None
 
 
 def run(
-    cfg: InspectConfig,
-    simplified: Path | None,
-    traces: Path | None,
-    data: Path,
-    out: Path,
-    *,
-    workers: int = 0,
+    cfg: InspectConfig, simplified: Path | None, traces: Path | None, data: Path, out: Path, *, workers: int = 0,
     watch: Watch = Watch(),
-) -> Path:
+) -> Path:  # fmt: skip
     """Read the simplified map, the plans and the playback tree; write `inspect.json` and `report.html`. Return the path
     of `inspect.json`.
 

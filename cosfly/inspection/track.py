@@ -51,13 +51,9 @@ class InspectedTrack(BaseModel):
 
 
 def inspect_track(
-    folder: Path,
-    root: Path,
-    traces: dict[str, DroneTrace] | None,
-    obstacles: BoxIndex | None,
-    cfg: InspectConfig,
+    folder: Path, root: Path, traces: dict[str, DroneTrace] | None, obstacles: BoxIndex | None, cfg: InspectConfig,
     yaw_rate_max_degps: float,
-) -> InspectedTrack:
+) -> InspectedTrack:  # fmt: skip
     """Check one track folder.
 
     Args:

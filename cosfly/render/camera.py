@@ -177,13 +177,9 @@ class ZoomConfig(Config):
 
 
 def zoomed_deg(
-    first_deg: float,
-    fovs_deg: Sequence[float],
-    zoom: ZoomConfig,
-    time_s: np.ndarray,
-    segments: Sequence[Segment],
+    first_deg: float, fovs_deg: Sequence[float], zoom: ZoomConfig, time_s: np.ndarray, segments: Sequence[Segment],
     rng: np.random.Generator,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Return the field of view at each time, (n,) degrees; each part of the trajectory has another level if possible.
 
     Within a change the picture grows by equal factors in equal times, with smooth ends.

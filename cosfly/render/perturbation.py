@@ -163,14 +163,9 @@ class _Scene:
 
 
 def perturb(
-    planned: Poses,
-    cameras: Sequence[Camera],
-    surroundings: Surroundings,
-    cfg: PerturbationConfig,
-    rng: np.random.Generator,
-    bystanders: DressedBystanders = NO_BYSTANDERS,
-    dt_s: float = DT_S,
-) -> PerturbedTrack:
+    planned: Poses, cameras: Sequence[Camera], surroundings: Surroundings, cfg: PerturbationConfig,
+    rng: np.random.Generator, bystanders: DressedBystanders = NO_BYSTANDERS, dt_s: float = DT_S,
+) -> PerturbedTrack:  # fmt: skip
     """Perturb every frame of a trajectory. dt_s: between frames. The random draws do not depend on the map."""
     scene = _Scene(planned, cameras, surroundings, cfg, bystanders)
     if cfg.correlation_s == 0:

@@ -52,14 +52,9 @@ FROM_ONE_RUN = "pass the others.json that was written together with path.json"
 
 
 def open_renderer(
-    name: str,
-    box_map: BoxMap,
-    width_px: int,
-    height_px: int,
-    look: Look | None = None,
-    num_others: int = 0,
+    name: str, box_map: BoxMap, width_px: int, height_px: int, look: Look | None = None, num_others: int = 0,
     settings: Config | None = None,
-) -> Renderer:
+) -> Renderer:  # fmt: skip
     """Open a renderer for one map and at most `num_others` bystanders; settings: the renderer's own, if it has any."""
     module, _, attribute = RENDERERS[name].partition(":")
     options = {} if settings is None else {"settings": settings}
@@ -88,16 +83,9 @@ def camera_of(cfg: RenderConfig, fov_deg: float) -> Camera:
 
 
 def make_track_script(
-    planned: DroneTrace,
-    path_index: int,
-    track: str,
-    town: str,
-    surroundings: Surroundings,
-    cfg: RenderConfig,
-    seed: int,
-    others: Sequence[Bystander] = (),
-    weather: WeatherRecord | None = None,
-) -> TrackScript:
+    planned: DroneTrace, path_index: int, track: str, town: str, surroundings: Surroundings, cfg: RenderConfig,
+    seed: int, others: Sequence[Bystander] = (), weather: WeatherRecord | None = None,
+) -> TrackScript:  # fmt: skip
     """Choose all that one track shows. Both tracks of a trajectory share field of view, people and weather.
 
     Args:
@@ -128,19 +116,10 @@ def make_track_script(
         rng = rng_for(seed, "render", f"{trace.path_id}/{PERTURBED}")
         perturbed = perturb(poses, cameras, surroundings, cfg.perturbation, rng, bystanders, step_s(trace.time_s))
     return TrackScript(
-        town=town,
-        trajectory=f"{TRAJECTORY}{cfg.first_timestamp + path_index}",
-        variant=VARIANTS[track],
-        path_index=path_index,
-        trace=trace,
-        cameras=cameras,
-        perturbed=perturbed,
-        gait=gait.since(len(before_m)),
-        clothes=clothes,
-        bystanders=bystanders,
-        look=cfg.look if weather is None else None,
-        weather=weather,
-    )
+        town=town, trajectory=f"{TRAJECTORY}{cfg.first_timestamp + path_index}", variant=VARIANTS[track],
+        path_index=path_index, trace=trace, cameras=cameras, perturbed=perturbed, gait=gait.since(len(before_m)),
+        clothes=clothes, bystanders=bystanders, look=cfg.look if weather is None else None, weather=weather,
+    )  # fmt: skip
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
@@ -156,17 +135,9 @@ class RenderInputs(NamedTuple):
 
 
 def run(
-    cfg: RenderConfig,
-    boxes: Path,
-    simplified: Path,
-    traces: Path,
-    out: Path,
-    *,
-    seed: int = 0,
-    workers: int = 0,
-    watch: Watch = Watch(),
-    others: Path | None = None,
-) -> Path:
+    cfg: RenderConfig, boxes: Path, simplified: Path, traces: Path, out: Path, *, seed: int = 0, workers: int = 0,
+    watch: Watch = Watch(), others: Path | None = None,
+) -> Path:  # fmt: skip
     """Read the maps `boxes_3d.json` (drawn) and `step2_simplified.json` (clearance), `drone_trace.json` and, with
     bystanders, `others.json`; write the playback tree.
 

@@ -162,21 +162,14 @@ def draw_frame(renderer: Renderer, script: TrackScript, i: int, poses: Poses, vi
     visibility = rendered_visibility(frame, target_m, view, pose, camera, ids)
     is_person = frame.ids == PERSON_ID
     num_px = int(np.count_nonzero(is_person))
+    # A thin pole may hide the person and not the box: both depth and mask must show the target.
+    is_visible = view.in_view and visibility.score > visible_threshold and num_px > 0
     target_meta = TargetMeta(
-        world_location=target_m,
-        half_extents_m=PERSON_HALF_EXTENTS_M,
-        instance_id=PERSON_ID,
-        semantic_id=KINDS["Pedestrians"],
-        image_uv=_list_or_none(view.uv),
-        bbox_2d=_list_or_none(view.bbox_px),
-        mask_bbox_2d=_list_or_none(mask_box(is_person)),
-        depth_m=view.depth_m,
-        in_view=view.in_view,
-        # A thin pole may hide the person and not the box: both depth and mask must show the target.
-        visible=view.in_view and visibility.score > visible_threshold and num_px > 0,
-        visibility=visibility.score,
-        num_pixels=num_px,
-    )
+        world_location=target_m, half_extents_m=PERSON_HALF_EXTENTS_M, instance_id=PERSON_ID,
+        semantic_id=KINDS["Pedestrians"], image_uv=_list_or_none(view.uv), bbox_2d=_list_or_none(view.bbox_px),
+        mask_bbox_2d=_list_or_none(mask_box(is_person)), depth_m=view.depth_m, in_view=view.in_view, visible=is_visible,
+        visibility=visibility.score, num_pixels=num_px,
+    )  # fmt: skip
     bystanders_meta = script.bystanders.meta(i, frame, visibility) if bystanders else None
     return DrawnFrame(frame, target_meta, bystanders_meta)
 
@@ -194,25 +187,16 @@ def written_target(target: TargetMeta, frame: Frame) -> TargetMeta:
 def _annotation(script: TrackScript, i: int, drawn: DrawnFrame) -> FrameMeta:
     """Return `meta.json` of frame i, without the target's legibility, which takes time and is added in a thread."""
     perturbed = script.perturbed
+    perturbation = frames.PerturbationMeta(
+        **perturbed.states[i], drone_position=perturbed.drone_offsets_m[i],
+        target_position=perturbed.target_offsets_m[i], drone_rotation=perturbed.rotation_offsets_deg[i],
+    )  # fmt: skip
     return FrameMeta(
-        index=i,
-        time_s=float(script.trace.time_s[i]),
-        town=script.town,
-        trajectory=script.trajectory,
-        variant=script.variant,
-        camera=frames.camera_meta(script.cameras[i], NEAR_M, FAR_M),
-        drone_pose=np.hstack([perturbed.poses.positions_m[i], perturbed.poses.rotations_deg[i]]),
-        target=drawn.target,
-        perturbation=frames.PerturbationMeta(
-            **perturbed.states[i],
-            drone_position=perturbed.drone_offsets_m[i],
-            target_position=perturbed.target_offsets_m[i],
-            drone_rotation=perturbed.rotation_offsets_deg[i],
-        ),
-        look=script.look,
-        others=drawn.bystanders,
-        weather=script.weather,
-    )
+        index=i, time_s=float(script.trace.time_s[i]), town=script.town, trajectory=script.trajectory,
+        variant=script.variant, camera=frames.camera_meta(script.cameras[i], NEAR_M, FAR_M),
+        drone_pose=np.hstack([perturbed.poses.positions_m[i], perturbed.poses.rotations_deg[i]]), target=drawn.target,
+        perturbation=perturbation, look=script.look, others=drawn.bystanders, weather=script.weather,
+    )  # fmt: skip
 
 
 def _write_frame(folder: Path, frame: Frame, meta: FrameMeta, cfg: RenderConfig) -> tuple[TargetMeta, dict[str, str]]:
@@ -247,44 +231,33 @@ def _track(script: TrackScript, drawn: DrawnFrames) -> Track:
         values = [getattr(target, name) for target in drawn.targets]
         return np.array([[np.nan] * num if value is None else value for value in values])
 
+    target_record = TargetRecord(
+        visibility=np.array(drawn.visibility), uv=column("image_uv", 2), bbox=column("bbox_2d", 4),
+        mask_bbox=column("mask_bbox_2d", 4), **{name: column(name) for name in ("in_view", "visible", "depth_m")},
+    )  # fmt: skip
     offsets = perturbed.drone_offsets_m, perturbed.rotation_offsets_deg, perturbed.target_offsets_m
+    source = {
+        "path_index": script.path_index,
+        "scenario_id": trace.path_id,
+        "scenario_name": script.town,
+        "algorithm": trace.planner,
+        "clearance_min_m": trace.metrics.get("clearance_min_m"),
+        **pace_field(trace.pace),
+    }
     weather = {} if script.weather is None else {"weather": script.weather.model_dump()}
     points = [
         {"perturbation": dict(state), "target": target.model_dump(include=set(LEGIBILITY)), **point_fields}
         for state, target, point_fields in zip(perturbed.states, drawn.targets, drawn.point_fields, strict=True)
     ]
     return Track(
-        town=script.town,
-        trajectory=script.trajectory,
-        variant=script.variant,
-        camera=cameras[0],
-        intrinsics=np.array([camera.intrinsic for camera in cameras]) if zooms else None,
-        time_s=trace.time_s,
-        positions_m=perturbed.poses.positions_m,
-        rotations_deg=perturbed.poses.rotations_deg,
-        targets_m=perturbed.poses.targets_m,
-        target=TargetRecord(
-            visibility=np.array(drawn.visibility),
-            uv=column("image_uv", 2),
-            bbox=column("bbox_2d", 4),
-            mask_bbox=column("mask_bbox_2d", 4),
-            **{name: column(name) for name in ("in_view", "visible", "depth_m")},
-        ),
-        perturbation=Perturbation(perturbed.is_perturbed, *offsets),
-        source={
-            "path_index": script.path_index,
-            "scenario_id": trace.path_id,
-            "scenario_name": script.town,
-            "algorithm": trace.planner,
-            "clearance_min_m": trace.metrics.get("clearance_min_m"),
-            **pace_field(trace.pace),
-        },
-        segments=trace.segments,
-        mission=trace.mission,
-        people=script.bystanders.people(script.clothes.looks),
-        is_original=script.variant == VARIANTS["clean"],
-        raw={**weather, "points": points},
-    )
+        town=script.town, trajectory=script.trajectory, variant=script.variant,
+        camera=cameras[0], intrinsics=np.array([camera.intrinsic for camera in cameras]) if zooms else None,
+        time_s=trace.time_s, positions_m=perturbed.poses.positions_m, rotations_deg=perturbed.poses.rotations_deg,
+        targets_m=perturbed.poses.targets_m, target=target_record,
+        perturbation=Perturbation(perturbed.is_perturbed, *offsets), source=source,
+        segments=trace.segments, mission=trace.mission, people=script.bystanders.people(script.clothes.looks),
+        is_original=script.variant == VARIANTS["clean"], raw={**weather, "points": points},
+    )  # fmt: skip
 
 
 # --- the goal in words ------------------------------------------------------------------------------------------------

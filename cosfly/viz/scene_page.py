@@ -54,14 +54,9 @@ class PageTrack:
 
 
 def run(
-    map_: Path,
-    out: Path,
-    *,
-    paths: Path | None = None,
-    traces: Sequence[Path] = (),
-    data: Path | None = None,
+    map_: Path, out: Path, *, paths: Path | None = None, traces: Sequence[Path] = (), data: Path | None = None,
     picture_px: int = 320,
-) -> Path:
+) -> Path:  # fmt: skip
     """Read a map, pedestrian trajectories, drone trajectories of planners and a playback tree; write one page."""
     box_map = read_boxes(map_)
     notes = list[str]()

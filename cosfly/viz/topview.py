@@ -94,16 +94,9 @@ def draw_dot(picture: np.ndarray, point: np.ndarray, radius_px: int, color: Colo
 
 
 def draw_text(
-    picture: np.ndarray,
-    text: str,
-    x: float,
-    y: float,
-    scale: float = 0.55,
-    color: Color = INK,
-    *,
-    align: float = 0.0,
+    picture: np.ndarray, text: str, x: float, y: float, scale: float = 0.55, color: Color = INK, *, align: float = 0.0,
     halo: Color | None = None,
-) -> int:
+) -> int:  # fmt: skip
     """Write text with its baseline at y; return the x of its end. align: 0 begins at x, 0.5 is centred, 1 ends at x."""
     width = cv2.getTextSize(text, FONT, scale, 1)[0][0]
     left = round(x - align * width)

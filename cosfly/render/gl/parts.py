@@ -152,14 +152,11 @@ class Boxes:
         records["tag"] = tags(self.kind, material, self.ids)
         records["bias"] = LAYER_STEP * (STANDING_LAYER if layer is None else layer + self.tiers)
         return Parts(
-            records=records,
-            mesh=np.full(num_boxes, mesh, np.uint8),
-            centers=centers,
+            records=records, mesh=np.full(num_boxes, mesh, np.uint8), centers=centers,
             object_centers=self.centers.astype(np.float32),
             object_radii=np.linalg.norm(self.half, axis=1).astype(np.float32),
-            min_px=np.full(num_boxes, min_px, np.float32),
-            max_px=np.full(num_boxes, max_px, np.float32),
-        )
+            min_px=np.full(num_boxes, min_px, np.float32), max_px=np.full(num_boxes, max_px, np.float32),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
