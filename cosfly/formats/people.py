@@ -22,6 +22,9 @@ COLORS: dict[str, tuple[Words, tuple[float, float, float]]] = {
 }
 GARMENTS: dict[str, dict[str, Words]] = _WARDROBE["garments"]  # slot -> name -> words; the name "" is none
 FIGURES: dict[str, Words] = _WARDROBE["figures"]
+# The terms that a goal may use, in the order of its words.
+GARMENT_TERMS = ("top", "legs", "bag", "hat")
+GOAL_TERMS = ("figure", *GARMENT_TERMS, "left", "right", "near", "far")
 EMPTY_SHARE = {"hat": 0.6, "bag": 0.4}  # share of people without one
 HAIR = ("brown", "grey", "black")  # no hat has these colours: from the air it would look like hair
 
@@ -84,11 +87,6 @@ def _allowed(name: str, record: dict) -> tuple[str, ...]:
     if name in GARMENTS:
         return tuple(GARMENTS[name])
     return tuple(COLORS) if record.get(name.removesuffix("_color")) else ("",)
-
-
-GARMENT_TERMS = ("top", "legs", "bag", "hat")
-# The terms that a goal may use, in the order of its words.
-GOAL_TERMS = ("figure", *GARMENT_TERMS, "left", "right", "near", "far")
 
 
 @dataclass(frozen=True)

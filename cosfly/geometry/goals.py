@@ -72,7 +72,10 @@ class SeenFrame:
 def meant(says: Iterable[str], looks: Appearance, people: Mapping[int, Appearance], picture: SeenFrame) -> set[int]:
     """Return the instance ids of the people that a description fits.
 
-    says: the description. looks: appearance for its slots. people: appearance by instance id.
+    Args:
+        says: The description.
+        looks: The appearance that its slots describe.
+        people: Appearance by instance id.
     """
     slots = {*says} - {*SIDES}
     fitting = set()
@@ -93,21 +96,23 @@ def _excess(relation: str, person_ids: Collection[int], picture: SeenFrame) -> d
 
 
 def find_says(
-    people: Mapping[int, Appearance], picture: SeenFrame, tells: Callable[[str, Appearance], bool],
-    shows: Callable[[str, int], bool] = lambda slot, number: True,
+    people: Mapping[int, Appearance], picture: SeenFrame, target_differs: Callable[[str, Appearance], bool],
+    rival_differs: Callable[[str, int], bool] = lambda slot, person_id: True,
 ) -> tuple[str, ...] | None:  # fmt: skip
     """Find the shortest description that only the target (PERSON_ID) fits in a picture; None if there is none.
 
     A relation is added only if clothing alone fits others too.
 
-    tells: (slot, appearance) -> whether the picture shows that the target does not look like that in the slot. shows:
-    (slot, id) -> whether it shows that this other person does not look like the target in the slot.
+    Args:
+        people: Appearance by instance id.
+        target_differs: Whether the picture shows that the target does not look like an appearance in a slot.
+        rival_differs: Whether it shows that a person, by instance id, does not look like the target in a slot.
     """
     looks = people[PERSON_ID]
     rivals = {
         person_id: person for person_id, person in people.items() if person_id != PERSON_ID and picture.shows(person_id)
     }
-    noun = ("figure",) if tells("figure", otherwise(looks, "figure")) else ()
+    noun = ("figure",) if target_differs("figure", otherwise(looks, "figure")) else ()
     best_says: tuple[str, ...] | None = None
     best_rivals: set[int] = set()  # rivals that the best description fits too
     for chosen in chain.from_iterable(combinations(SLOTS, size) for size in range(1, len(SLOTS) + 1)):
@@ -115,12 +120,12 @@ def find_says(
         differing = {person_id: {*says} & {*looks.differences(person)} for person_id, person in rivals.items()}
         num_equal = sum(not slots for slots in differing.values())
         if best_says is not None and num_equal >= len(best_rivals):
-            continue  # it cannot be better; `tells` renders pictures
-        if not all(tells(slot, otherwise(looks, slot)) for slot in chosen):
+            continue  # it cannot be better; `target_differs` renders pictures
+        if not all(target_differs(slot, otherwise(looks, slot)) for slot in chosen):
             continue
         confused = set()
         for person_id, slots in differing.items():
-            if not any(tells(slot, rivals[person_id]) and shows(slot, person_id) for slot in slots):
+            if not any(target_differs(slot, rivals[person_id]) and rival_differs(slot, person_id) for slot in slots):
                 confused.add(person_id)
         if best_says is None or len(confused) < len(best_rivals):
             best_says = says

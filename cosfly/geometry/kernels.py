@@ -55,10 +55,11 @@ def index_boxes(
     """Sort boxes into cells.
 
     Args:
-        centers, half_extents: (k, 3) m. rotations: (k, 3, 3) world_from_box. cell_m: wanted cell size, grown if the map
-            is vast.
+        centers, half_extents: (k, 3) m.
+        rotations: (k, 3, 3) world_from_box.
+        cell_m: Side of a cell; it is doubled until a vast map has at most MAX_CELLS.
     """
-    centers, half_extents, rotations = _points(centers), _points(half_extents), _points(rotations)
+    centers, half_extents, rotations = map(_points, (centers, half_extents, rotations))
     spans = np.einsum("kij,kj->ki", np.abs(rotations), half_extents)
     mins, maxs = centers - spans, centers + spans
     low = mins[:, :2].min(axis=0) if len(centers) else np.zeros(2)
@@ -213,8 +214,10 @@ def segment_to_box(rows, box, ax, ay, az, bx, by, bz):
     """
     u, v, w = in_box_frame(rows, box, ax, ay, az)
     p, q, r = turned(rows, box, bx - ax, by - ay, bz - az)
-    starts, ways = (u, v, w), (p, q, r)
-    low, low_slope, high, high_slope = 0.0, -np.inf, 1.0, np.inf
+    starts = (u, v, w)
+    ways = (p, q, r)
+    low, low_slope = 0.0, -np.inf
+    high, high_slope = 1.0, np.inf
     for candidate in range(8):  # 0 to 5: the faces, two on each axis; 6 and 7: the ends
         share = float(candidate - 6)
         if candidate < 6:
@@ -227,7 +230,8 @@ def segment_to_box(rows, box, ax, ay, az, bx, by, bz):
                 continue
         slope = 0.0
         for axis in range(3):
-            x, half = starts[axis] + share * ways[axis], rows[box, HALF_X + axis]
+            x = starts[axis] + share * ways[axis]
+            half = rows[box, HALF_X + axis]
             slope += (x - min(max(x, -half), half)) * ways[axis]
         if slope <= 0.0 and share >= low:
             low, low_slope = share, slope
@@ -288,8 +292,8 @@ def collect_hits(index, ax, ay, az, bx, by, bz, inflate_m, out):
     num_hits = 0
     if len(index.rows) == 0 or len(out) == 0:
         return num_hits
-    cell, num_x, num_y = index.grid[CELL], index.shape[0], index.shape[1]
-    ox, oy = index.grid[ORIGIN_X], index.grid[ORIGIN_Y]
+    num_x, num_y = index.shape[0], index.shape[1]
+    ox, oy, cell = index.grid[ORIGIN_X], index.grid[ORIGIN_Y], index.grid[CELL]
     reach = CORNER * inflate_m
     first_x = max(int(np.floor((min(ax, bx) - reach - ox) / cell)), 0)
     last_x = min(int(np.floor((max(ax, bx) + reach - ox) / cell)), num_x - 1)
@@ -323,13 +327,15 @@ def free_rays(index, boxes, num_boxes, x, y, z, target):
     """Return the fraction of the five rays from a point to a target that none of `boxes[:num_boxes]` touches."""
     free = 0
     for ray in range(5):
-        tx, ty = target[0] + RAY_OFFSETS_M[ray, 0], target[1] + RAY_OFFSETS_M[ray, 1]
-        tz, blocked = target[2] + RAY_OFFSETS_M[ray, 2], False
+        tx = target[0] + RAY_OFFSETS_M[ray, 0]
+        ty = target[1] + RAY_OFFSETS_M[ray, 1]
+        tz = target[2] + RAY_OFFSETS_M[ray, 2]
+        is_blocked = False
         for k in range(num_boxes):
             if segment_hits_box(index.rows, boxes[k], tx, ty, tz, x, y, z, 0.0):
-                blocked = True
+                is_blocked = True
                 break
-        if not blocked:
+        if not is_blocked:
             free += 1
     return free / 5.0
 
@@ -350,7 +356,8 @@ def signed_distances(index: BoxIndex, points: np.ndarray, reach_m: float = np.in
 
 @njit(cache=True)
 def _signed_distances(index, points, reach_m):
-    distances, boxes = np.empty(len(points)), np.empty(len(points), dtype=np.int64)
+    distances = np.empty(len(points))
+    boxes = np.empty(len(points), dtype=np.int64)
     for i in range(len(points)):
         distances[i], boxes[i] = nearest_box(index, points[i, 0], points[i, 1], points[i, 2], reach_m)
     return distances, boxes
@@ -440,7 +447,8 @@ def visibility(index: BoxIndex, drones: np.ndarray, targets: np.ndarray) -> np.n
 
 @njit(cache=True)
 def _visibility(index, drones, targets):
-    fractions, boxes = np.empty(len(drones)), np.empty(len(index.rows), dtype=np.int64)
+    fractions = np.empty(len(drones))
+    boxes = np.empty(len(index.rows), dtype=np.int64)
     for i in range(len(drones)):
         drone, target = drones[i], targets[i]
         count = collect_hits(index, target[0], target[1], target[2], drone[0], drone[1], drone[2], RAY_SPREAD_M, boxes)

@@ -24,7 +24,8 @@ def without_perturbation(
     """Subtract a perturbation: the shifts of drone and target, the turn of the view, and the new aim after the shifts.
 
     Args:
-        poses, offsets: (n, 6) x, y, z in m, pitch, yaw, roll in degrees. targets_m, target_offsets_m: (n, 3).
+        poses, offsets: (n, 6) x, y, z in m, pitch, yaw, roll in degrees.
+        targets_m, target_offsets_m: (n, 3).
     Returns:
         poses (n, 6) and targets (n, 3); NaN where the perturbation of a frame is not recorded.
     """
@@ -42,16 +43,13 @@ def without_perturbation(
 
 @dataclass(frozen=True)
 class PlannedMotion:
-    """The planned motion of a track, n frames.
+    """The planned motion of a track of n frames."""
 
-    time_s: (n,). poses: (n, 6) planned poses at the frames; NaN where unknown. yaw_deg, positions_m: (n,), (n, 3) of
-    the frames as rendered, with perturbations; actions and waypoints are relative to these.
-    """
-
-    time_s: np.ndarray
-    poses: np.ndarray
-    yaw_deg: np.ndarray
-    positions_m: np.ndarray
+    time_s: np.ndarray  # (n,)
+    poses: np.ndarray  # (n, 6) planned; NaN where unknown
+    # Of the frames as rendered, with perturbations; actions and waypoints are relative to them.
+    yaw_deg: np.ndarray  # (n,)
+    positions_m: np.ndarray  # (n, 3)
 
     @cached_property
     def action(self) -> np.ndarray:

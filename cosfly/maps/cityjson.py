@@ -425,8 +425,10 @@ def _flattened(objects: list[CityObject]) -> list[CityObject]:
 
 
 def _heights_between(samples: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the function from places, (n, 2), to heights, (n,): linear between samples, (k, 3), and about that of the
-    border beyond them."""
+    """Return the function from places, (n, 2), to heights, (n,): linear between samples, (k, 3).
+
+    Beyond the samples a height is about that of the border.
+    """
     # Imported here: half a second that every command would spend for the settings of the maps.
     from scipy.interpolate import LinearNDInterpolator
 

@@ -174,17 +174,17 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
     )
     dropped.check(world, len(nodes), cfg.most_skipped, expected)
     widths: dict[str, float] = {}
-    num_of_world = len(boxes)
+    num_of_objects = num_with_roads = len(boxes)
     if not has_surfaces:
         widths = _add_roads(boxes, roads)
-        size_sources["road"] = len(boxes) - num_of_world
-        num_of_world = len(boxes)
+        num_with_roads = len(boxes)
         _add_ground_and_paint(boxes, roads, widths)
+    size_sources["road"] = num_with_roads - num_of_objects
     tool = "cosfly world" if has_surfaces else "SimWorld city generator"
     header = MapHeader(
         name=cfg.name, source=MapSource(tool=tool, version="world file", file=world.name), licence=cfg.licence,
         credits=cfg.credits, ground_z_m=0.0, extent_sources=size_sources, roads=widths,
-        added_boxes=len(boxes) - num_of_world, num_objects=len(nodes), dropped_objects=dict(dropped.counts),
+        added_boxes=len(boxes) - num_with_roads, num_objects=len(nodes), dropped_objects=dict(dropped.counts),
     )  # fmt: skip
     return boxes.box_map(header)
 

@@ -24,10 +24,12 @@ from cosfly.maps.town_parts import (
     RAILING_M,
     WATER_BOTTOM_M,
     WATER_TOP_M,
+    WIDE_M,
     Plot,
     Range,
     add_road_paint,
     furnish,
+    pavement_m,
     point,
 )
 from cosfly.runtime.config import Config, read_yaml
@@ -37,7 +39,7 @@ from cosfly.runtime.seeding import rng_for
 GENERATOR_VERSION = "1"
 
 MIN_BLOCK_M = 34.0  # no kind of block fits into a smaller one
-WIDE_M = 26.0  # wider streets have wide pavements and large trees
+
 VERGE_M = 10.0  # of lawn around the town
 
 
@@ -206,8 +208,8 @@ def _strips(plan: TownPlan, widest: int, widest_m: float, rng: np.random.Generat
     strips = []
     at_m = -plan.size_m / 2 + VERGE_M
     for width_m, side_m in zip(widths_m, [*sides_m.tolist(), 0.0], strict=True):
-        sidewalk_m = 6.0 if width_m >= WIDE_M else max(2.5, 0.22 * width_m)
-        strips.append(Strip(at_m, at_m + width_m, (at_m + sidewalk_m, at_m + width_m - sidewalk_m)))
+        kerbs = at_m + pavement_m(width_m), at_m + width_m - pavement_m(width_m)
+        strips.append(Strip(at_m, at_m + width_m, kerbs))
         at_m += width_m + side_m
     return strips
 

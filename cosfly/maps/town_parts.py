@@ -8,6 +8,7 @@ import numpy as np
 from cosfly.maps.boxlist import PAINT_TOP_M, ROAD_TOP_M, SLAB_M, TOPS_M, BoxList, Pair
 
 WATER_TOP_M = 0.05  # over the ground, so that water is an obstacle to pedestrians
+WIDE_M = 26.0  # wider streets have wide pavements and large trees
 PASSAGE_M = 3.2  # clear height of passages and arcades
 ARCADE_M = 3.0  # depth of an arcade
 RAILING_M = 0.2
@@ -24,6 +25,11 @@ Range = tuple[float, float]
 def point(axis: int, along: float, across: float) -> tuple[float, float]:
     """Return a point of a street along x (axis 0) or along y (axis 1)."""
     return (along, across) if axis == 0 else (across, along)
+
+
+def pavement_m(street_m: float) -> float:
+    """Return the width of each pavement of a street from its width from front to front."""
+    return 6.0 if street_m >= WIDE_M else max(2.5, 0.22 * street_m)
 
 
 class Plot(BoxList):

@@ -32,8 +32,10 @@ def find_route(
     """Find a cheapest route between two cells, (k, 2) int64 cells with both ends; None if there is no route.
 
     Args:
-        free: (ny, nx) bool, contiguous; start, goal: (x index, y index).
-        classes: (ny, nx) uint8, places in `costs`; None: all 0. costs: (classes,) int64, at least 1, of a cell.
+        free: (ny, nx) bool, contiguous.
+        start, goal: (x index, y index).
+        classes: (ny, nx) uint8, the class of each cell; None: all 0.
+        costs: (classes,) int64, the cost of a cell by its class, at least 1.
     """
     num_x = free.shape[1]
     # Zeroed pages are allocated on access, so a search pays for the cells it visits and not for the grid.
@@ -65,8 +67,8 @@ def route_cost(cells: np.ndarray) -> float:
 def _search(free, origin, target, state, steps, from_direction, classes, costs, least):  # pragma: no cover (compiled)
     """Run A* until the target is closed; return whether it was reached.
 
-    state, from_direction: (cells,), written. steps: (cells, 2), written, weighted straight and diagonal steps times
-    two: a step costs the sum of its two cells.
+    The arrays state and from_direction, (cells,), and steps, (cells, 2), are filled. `steps` holds the weighted
+    straight and diagonal steps to a cell, times two: a step costs the sum of its two cells.
     """
     num_y, num_x = free.shape
     target_x, target_y = target % num_x, target // num_x

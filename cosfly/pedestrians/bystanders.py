@@ -5,8 +5,6 @@ would collide waits a little before that place. If waiting does not help, it is 
 tries, so there may be fewer than requested.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

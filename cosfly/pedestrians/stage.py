@@ -200,8 +200,12 @@ def run(
     cfg: PedestriansConfig, simplified_map: Path, out: Path, *, seed: int = 0, workers: int = 0,
     watch: Watch = Watch(), roi: Path | None = None,
 ) -> Path:  # fmt: skip
-    """Read `step2_simplified.json` (and `roi`, a region of interest); write `path.json`, a report and `paths.png`, and
-    `others.json` if there are bystanders; return the path of `path.json`. Failed trajectories are counted.
+    """Make pedestrian trajectories on `step2_simplified.json`; return the path of `path.json`.
+
+    The other products are a report, `paths.png`, and `others.json` if there are bystanders. Failed trajectories are
+    counted.
+
+    roi: File of a region of interest, outside which nobody walks.
     """
     inputs = {"map": simplified_map} | ({"roi": roi} if roi else {})
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed)

@@ -194,11 +194,15 @@ def walkable_ground(
     box_map: BoxMap, cfg: PedestriansConfig, roi: Roi | None = None, *, where: str | Path = "map",
     roi_where: str | Path = "region of interest", seconds: StepSeconds | None = None,
 ) -> WalkableGround:  # fmt: skip
-    """Return the walkable ground of a map; `where` and `roi_where` are the files to name in an error.
+    """Return the walkable ground of a map.
 
     Components are 8-connected, as in the paper, and those below `min_component_cells` are not used. A route that never
     cuts a corner cannot pass between two cells that touch at a corner only, so an 8-connected component may hold
     several parts; both ends of a route are drawn from one part, so that it exists.
+
+    Args:
+        where, roi_where: Files of the map and of the region, for errors.
+        seconds: The durations of the steps are added to it.
     """
     seconds = StepSeconds(float) if seconds is None else seconds
     with timed(seconds, "grid"):
@@ -238,12 +242,10 @@ def walkable_ground(
     counts |= component_counts
     ground = WalkableGround(grid, inflated, parts, footing, box_map.ground_z_m, costs, is_in_roi, counts)
     if not ground.may_end.any():
-        raise NoPathError(
-            "all walkable ground is road, but pedestrian trajectories must start and end off the road", where=where,
-            got=f"{counts['cells_used']} walkable cells, all Roads",
-            fix="add boxes of type Sidewalks or Ground, or allow starts on roads with pedestrians.road_cost=1",
-            expected="pavements, squares or paths",
-        )  # fmt: skip
+        what = "all walkable ground is road, but pedestrian trajectories must start and end off the road"
+        got = f"{counts['cells_used']} walkable cells, all Roads"
+        fix = "add boxes of type Sidewalks or Ground, or allow starts on roads with pedestrians.road_cost=1"
+        raise NoPathError(what, where=where, got=got, expected="pavements, squares or paths", fix=fix)
     return ground
 
 

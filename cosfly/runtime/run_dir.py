@@ -409,15 +409,12 @@ def _holds_work(out: Path, begun: Collection[str]) -> bool:
 def _check_same(out: Path, record: StageRecord) -> None:
     """Raise ResumeError if `record` does not agree with the record of the work in a folder."""
     previous = read_stage_record(out)
-    before = flattened(previous.config)
-    after = flattened(record.config)
+    before = flattened(previous.config) | {"seed": previous.seed}
+    after = flattened(record.config) | {"seed": record.seed}
     differences = []
-    for key in [*sorted((before.keys() | after.keys()) - {"seed"}), "seed"]:
-        old_value, new_value = before.get(key), after.get(key)
-        if key == "seed":
-            old_value, new_value = previous.seed, record.seed
-        if old_value != new_value:
-            differences.append(f"{key} was {shown(old_value)}, is {shown(new_value)}")
+    for key in sorted(before.keys() | after.keys(), key=lambda key: (key == "seed", key)):  # the seed last
+        if before.get(key) != after.get(key):
+            differences.append(f"{key} was {shown(before.get(key))}, is {shown(after.get(key))}")
     for name in sorted(previous.inputs.keys() | record.inputs.keys()):
         old = previous.inputs.get(name)
         new = record.inputs.get(name)

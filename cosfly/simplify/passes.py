@@ -170,8 +170,10 @@ def _rows_by_label(rows: np.ndarray, labels: np.ndarray) -> list[np.ndarray]:
 
 
 def clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:
-    """Return the lowest row of each box's cluster, (n,) int64: boxes, (n, 3) m, with gaps of at most `gap_m` on every
-    axis."""
+    """Return the lowest row of each box's cluster, (n,) int64; boxes in it have gaps of at most `gap_m` on every axis.
+
+    mins, maxs: (n, 3) m.
+    """
     # Imported here, because every command reads the settings of this module.
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -245,8 +247,10 @@ def _upright(box_map: BoxMap, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _feet(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
-    """Return x, y and half widths, (k, 4), of a stem for every vegetation box that spans the cut height; taken before
-    the merge, because a merged grove still has one stem for each of its trees."""
+    """Return x, y and half widths, (k, 4), of a stem for every vegetation box that spans the cut height.
+
+    They are taken before the merge: a merged grove still has one stem for each of its trees.
+    """
     rows, _ = _spanning(box_map, cfg)
     rows = rows[box_map.mins[rows, 2] <= box_map.ground_z_m + FOOT_M]
     half = np.minimum(box_map.half_extents[rows, :2].min(axis=1), cfg.stem_radius_m)
@@ -259,7 +263,8 @@ def crop_tree(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray, feet: 
     Boxes wholly below the cut (bushes, hedges) and wholly above it stay as they are, so a second pass changes nothing.
 
     Args:
-        used_ids: ids that new boxes may not take. feet: (k, 4) stems below the canopies; None: full footprints.
+        used_ids: ids that new boxes may not take.
+        feet: (k, 4) stems below the canopies; None: full footprints.
     Source: sec:step2, "Crop tree operation"; stems are ours.
     """
     rows, cut_m = _spanning(box_map, cfg)
@@ -285,13 +290,13 @@ def crop_tree(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray, feet: 
 
 
 def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray) -> BoxMap:
-    """Cut vegetation that is higher than `adaptive_height_m` into a stem, one cell wide, below `split_z_m` and pieces
-    no higher than that above, with ids that are not in `used_ids`.
+    """Cut vegetation that is higher than `adaptive_height_m` into a stem and pieces no higher than that above it.
 
-    The paper names three numbers and their purpose, tall trees in shorter pieces that do not block the walking grid
-    from afar, but no rule; this is ours. The lowest piece above the cut keeps the id; without one, the stem does.
+    The stem is one cell wide and ends at `split_z_m`. The lowest piece above it keeps the id, without one the stem;
+    the others get ids that are not in `used_ids`.
 
-    Source: app:simworld:step3, "crop_tree".
+    Source: app:simworld:step3, "crop_tree". The paper names three numbers and their purpose, tall trees in shorter
+    pieces that do not block the walking grid from afar, but no rule; this one is ours.
     """
     ground_z_m = box_map.ground_z_m
     split_m = ground_z_m + cfg.split_z_m

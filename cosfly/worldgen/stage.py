@@ -165,8 +165,10 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
 
 
 def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
-    """Read a prompt; write trace.json, plan.json, layout.json, placement.json, combined_world.json with Bbox.json,
-    checks.json, map.png, and loop.yaml: settings for `cosfly run` on the world.
+    """Make a world from a prompt; return the path of its file, `combined_world.json`, with Bbox.json next to it.
+
+    The other products: trace.json, plan.json, layout.json, placement.json, checks.json, map.png, and loop.yaml, the
+    settings for `cosfly run` on the world.
     """
     prompt = " ".join(cfg.prompt.split())
     if not re.search(r"\w", prompt) or len(prompt) > MOST_CHARACTERS:

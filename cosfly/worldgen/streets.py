@@ -18,12 +18,12 @@ from shapely.geometry.base import BaseGeometry
 
 from cosfly.maps.boxlist import PAVED_TOP_M, ROAD_TOP_M, SLAB_M, BoxList
 from cosfly.maps.footprints import Rectangle, cover, polygons_of, rectangle_polygon
-from cosfly.maps.town_parts import RAILING_M, WATER_BOTTOM_M, WATER_TOP_M, Plot, add_road_paint, furnish
+from cosfly.maps.town_parts import RAILING_M, WATER_BOTTOM_M, WATER_TOP_M, Plot, add_road_paint, furnish, pavement_m
 from cosfly.worldgen.plan import PATH_M, VERGE_M, Range, WorldPlan
 
 # Streets.
 LANE_M = 9.0  # narrower streets have no carriageway
-WIDE_M = 26.0  # wider streets have wide pavements
+
 PARALLEL_M = 16.0  # a street that is nearer to a bank or to the promenade all along is dropped
 GRID_M = 0.05  # of the ends of streets
 # Share of the distance between crossings within which the corners of irregular cells are one.
@@ -57,8 +57,7 @@ class StraightStreet:
     @property
     def road_m(self) -> float:
         """Width of the carriageway; 0 for lanes and paths."""
-        pavement_m = 6.0 if self.width_m >= WIDE_M else max(2.5, 0.22 * self.width_m)
-        return self.width_m - 2 * pavement_m if self.width_m >= LANE_M else 0.0
+        return self.width_m - 2 * pavement_m(self.width_m) if self.width_m >= LANE_M else 0.0
 
     @property
     def length_m(self) -> float:
