@@ -68,8 +68,8 @@ def read_numerals(text: str, language: Language) -> list[Numeral]:
         if stands_at("more", before, after, language):
             bound = 1
         is_about = stands_at("about", before, after, language)
-        text = match.group().strip()
-        numerals.append(Numeral(text, value * factor, unit, digits, factor, bound, is_about, match.start()))
+        written = match.group().strip()
+        numerals.append(Numeral(written, value * factor, unit, digits, factor, bound, is_about, match.start()))
     return numerals
 
 
