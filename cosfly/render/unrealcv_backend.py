@@ -104,7 +104,8 @@ class UnrealCvRenderer(SimulatorRenderer):
         self._server.run(*(f"vset /object/{name}/destroy" for name in leftover))
         objects = self._read_objects([name for name in str(answer).split() if name not in leftover])
         num_doubtful = self._make_tables(objects)
-        self._check_level({part.name: part.row for part in objects if part.row is not None}, num_doubtful)
+        rows = {level_object.name: level_object.row for level_object in objects if level_object.row is not None}
+        self._check_level(rows, num_doubtful)
         self._server.run(f"vset {CAMERA}/size {self._size_px[0]} {self._size_px[1]}")
 
     def _read_objects(self, names: list[str]) -> list[_LevelObject]:
@@ -126,15 +127,15 @@ class UnrealCvRenderer(SimulatorRenderer):
         self._ids = np.full(COLORS, NO_INSTANCE, dtype=np.uint16)
         self._kinds = np.full(COLORS, KINDS["NONE"], dtype=np.uint8)
         self._used_colors = set()
-        for part in objects:
-            if part.color is None or part.color in self._used_colors:
+        for level_object in objects:
+            if level_object.color is None or level_object.color in self._used_colors:
                 continue
-            self._used_colors.add(part.color)
-            if part.row is None:
-                self._kinds[part.color] = KINDS[kind_of(part.class_name) or "Other"]
+            self._used_colors.add(level_object.color)
+            if level_object.row is None:
+                self._kinds[level_object.color] = KINDS[kind_of(level_object.class_name) or "Other"]
             else:
-                self._ids[part.color] = ids[part.row]
-                self._kinds[part.color] = self._map.kinds[part.row]
+                self._ids[level_object.color] = ids[level_object.row]
+                self._kinds[level_object.color] = self._map.kinds[level_object.row]
         return len(objects) - len(self._used_colors)
 
     def _check_level(self, row_of: dict[str, int], num_doubtful: int) -> None:
