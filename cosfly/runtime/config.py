@@ -223,10 +223,8 @@ def _group(model: Any, parents: Iterable[Any]) -> Any:
 
 
 def shipped(name: str) -> Path:
-    """Return the path of a file that ships in `configs/`: inside an installed package, next to it in a checkout."""
-    package = Path(__file__).parents[1]
-    installed = package / "configs"
-    return (installed if installed.is_dir() else package.with_name("configs")) / name
+    """Return the path of a file that ships in `configs/`, which is a link to the folder of the repository."""
+    return Path(__file__).parents[1] / "configs" / name
 
 
 def config_file(config: Path | None) -> Path | None:
