@@ -39,7 +39,6 @@ class Report:
     facts: list[str] = field(default_factory=list)  # lines about what was checked
 
     def add(self, severity: Severity, code: str, where: object, got: object, expected: str) -> None:
-        """Add a finding."""
         self.issues.append(
             Issue(severity=severity, code=code, where=cut(str(where)), got=cut(str(got)), expected=expected)
         )

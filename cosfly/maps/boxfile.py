@@ -170,8 +170,6 @@ class _Skipped(Exception):
 
 @dataclass
 class _BoxesOfRows:
-    """The boxes of all rows."""
-
     boxes: BoxList = field(default_factory=BoxList)
     row_of_box: list[int] = field(default_factory=list)  # index of the row of each box
     size_sources: Counter[str] = field(default_factory=Counter)  # number of boxes by the source of their sizes
@@ -294,7 +292,6 @@ def _ids_of(rows: Sequence[_Row]) -> list[int]:
 
 
 def _table_rows(cfg: BoxesConfig, path: Path) -> list[_Row]:
-    """Read the rows of a CSV table."""
     reader = csv.reader(io.StringIO(read_text(path, what="table of boxes").removeprefix("\ufeff")), strict=True)
     try:
         lines = [(f"line {reader.line_num}", [cell.strip() for cell in line]) for line in reader]

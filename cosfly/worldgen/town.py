@@ -53,8 +53,6 @@ Size = tuple[float, ...]
 
 
 class Placed(NamedTuple):
-    """One placed object."""
-
     name: str
     number: int  # among the objects of the name
     xy: tuple[float, float]  # middle, m
