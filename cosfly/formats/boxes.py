@@ -109,7 +109,6 @@ class BoxMap:
 
     @property
     def ground_z_m(self) -> float:
-        """The height of the ground."""
         return self.header.ground_z_m
 
     @property

@@ -75,8 +75,6 @@ def verdict_on(decision: str, label: str | None, contradicted: Collection[str]) 
 
 
 class Action(NamedTuple):
-    """One action."""
-
     group: str  # heading in tables
     en: str  # infinitive phrase
     zh: str

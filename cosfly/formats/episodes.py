@@ -40,8 +40,6 @@ _NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 
 
 class EpisodeFrame(Record):
-    """One frame."""
-
     time_s: FiniteFloat
     answer: Answer
     action: str | None = None
@@ -63,8 +61,6 @@ class EpisodeFrame(Record):
 
 
 class Episode(Record):
-    """The record of an episode."""
-
     episode: str = Field(min_length=1)  # its id, unique in a folder
     student: str
     engine: str
@@ -133,8 +129,6 @@ class Figure(Record):
 
 
 class EpisodeScore(Record):
-    """The measures of one episode."""
-
     episode: str
     town: str
     walk: str  # map and trajectory: episodes of one are correlated

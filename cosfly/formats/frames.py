@@ -141,8 +141,6 @@ def tree_yaw(yaw_deg: float) -> float:
 
 
 class CameraMeta(Record):
-    """The camera of a frame."""
-
     width: int
     height: int
     fov_deg: float
@@ -188,8 +186,6 @@ class TargetMeta(Record):
 
 
 class PerturbationMeta(Record):
-    """The perturbation of a frame."""
-
     position: str  # outcome of the event: none, applied, or fallback: reason
     rotation: str  # outcome of the event
     drone_position: Position  # offsets
@@ -198,8 +194,6 @@ class PerturbationMeta(Record):
 
 
 class BystanderMeta(Record):
-    """A bystander in a frame."""
-
     instance_id: int
     semantic_id: int
     world_location: Position  # of the centre of its box
@@ -297,7 +291,6 @@ def files_in(frame: Path) -> frozenset[str]:
 
 
 def tree_of(frame: Path) -> Path:
-    """Return the playback tree of a frame."""
     return tree_of_track(frame.absolute().parents[1])
 
 

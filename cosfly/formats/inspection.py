@@ -30,8 +30,6 @@ RESULTS: tuple[Result, ...] = ("accepted", "review", "rejected")
 
 
 class TrackInspection(Record):
-    """The result of one track."""
-
     town: str
     trajectory: str
     variant: str

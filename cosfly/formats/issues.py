@@ -33,13 +33,12 @@ def sort_key(issue: Issue) -> tuple:
 
 @dataclass
 class Report:
-    """Findings of one check run. facts: lines about what was checked."""
+    """Findings of one check run."""
 
     issues: list[Issue] = field(default_factory=list)
-    facts: list[str] = field(default_factory=list)
+    facts: list[str] = field(default_factory=list)  # lines about what was checked
 
     def add(self, severity: Severity, code: str, where: object, got: object, expected: str) -> None:
-        """Add a finding."""
         self.issues.append(
             Issue(severity=severity, code=code, where=cut(str(where)), got=cut(str(got)), expected=expected)
         )

@@ -102,7 +102,6 @@ class Track:
         return self.given_id or f"{self.trajectory}_{self.variant}"
 
     def camera_at(self, index: int) -> Camera:
-        """Return the camera of frame `index`."""
         return self.camera if self.intrinsics is None else replace(self.camera, intrinsic=self.intrinsics[index])
 
     @property

@@ -24,14 +24,11 @@ class RoiPolygon(BaseModel):
 
 
 class Roi(RoiPolygon):
-    """`roi_polygon.json`: the paper's form (one closed ring), and ours with holes and several outer rings.
-
-    map, axes: of the map that it was drawn on, where the file says so.
-    """
+    """`roi_polygon.json`: the paper's form (one closed ring), and ours with holes and several outer rings."""
 
     description: str = ""
-    map: str = ""
-    axes: str = ""
+    map: str = ""  # that it was drawn on, if the file names one
+    axes: str = ""  # of this map
     closed: bool = True
     polygons: list[RoiPolygon] = []
 

@@ -32,8 +32,6 @@ class ShownCaption:
 
 @dataclass(frozen=True)
 class ReleasedTrack:
-    """A track of a release."""
-
     flight: Track  # with all of its points
     captions: Sequence[ShownCaption]  # those that are released
     twin: Track | None  # the clean track of a perturbed one; None if it is not released

@@ -233,8 +233,9 @@ def connected_parts(free: np.ndarray, connectivity: int) -> tuple[np.ndarray, np
     """Label connected free cells.
 
     Args:
-        free: (ny, nx) bool; connectivity: 8 (the paper's components) or 4. A search that never cuts a corner moves
-            exactly within 4-connected parts: each of its diagonal steps has two straight neighbours.
+        free: (ny, nx) bool.
+        connectivity: 8 (the paper's components) or 4. A search that never cuts a corner moves exactly within
+            4-connected parts: each of its diagonal steps has two straight neighbours.
     Returns:
         labels (ny, nx) int32, 0 where not free; sizes (num_labels,) int64 in cells, sizes[0] = 0.
     """

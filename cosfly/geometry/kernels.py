@@ -347,7 +347,8 @@ def signed_distances(index: BoxIndex, points: np.ndarray, reach_m: float = np.in
     """Return the signed distance to the nearest box for many points.
 
     Args:
-        points: (n, 3) m. reach_m: boxes farther away are ignored.
+        points: (n, 3) m.
+        reach_m: Boxes farther away are ignored.
     Returns:
         (n,) m, at most reach_m, and (n,) the nearest box, -1 where there is none in reach (k == 0 too).
     """
@@ -401,7 +402,8 @@ def swept_distances(index: BoxIndex, points: np.ndarray, reach_m: float) -> tupl
     """Return the least distance to boxes on the segment from each point to the next; at the last point, its own.
 
     Args:
-        points: (n, 3) m. reach_m: boxes farther away are ignored.
+        points: (n, 3) m.
+        reach_m: Boxes farther away are ignored.
     Returns:
         (n,) m, at most reach_m, negative only where an end of the segment is inside a box, 0 where it passes through
         one; (n,) the share of the segment where that is; (n,) the box, -1 where none is in reach.

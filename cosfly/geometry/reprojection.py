@@ -57,7 +57,9 @@ class Agreement:
 def compare_views(a: View, b: View, intrinsics_a: np.ndarray, intrinsics_b: np.ndarray | None = None) -> Agreement:
     """Reproject the grid's points of frame a into frame b and back.
 
-    intrinsics_a: (4,) fx, fy, cx, cy of both frames. intrinsics_b: of frame b, if the camera has zoomed.
+    Args:
+        intrinsics_a: (4,) fx, fy, cx, cy of frame a.
+        intrinsics_b: Those of frame b; None: the same.
     """
     k_a = intrinsics_a.astype(np.float64)
     k_b = k_a if intrinsics_b is None else intrinsics_b.astype(np.float64)

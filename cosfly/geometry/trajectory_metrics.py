@@ -57,8 +57,10 @@ def trajectory_metrics(
     """Return all metrics of one trajectory as JSON, rounded to four decimals.
 
     Args:
-        positions_m, targets_m: (n, 3). visibility, clearances_m, ground_m: (n,). Altitudes are counted from the ground.
-        dt_s: between two positions.
+        positions_m, targets_m: (n, 3).
+        visibility, clearances_m: (n,).
+        ground_m: (n,) height of the ground, from which altitudes count.
+        dt_s: Time between two positions.
     """
     accel, jerk = (derivative_rms(positions_m, order, dt_s) for order in (2, 3))
     altitudes = positions_m[:, 2] - ground_m

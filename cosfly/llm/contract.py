@@ -34,8 +34,6 @@ class Request:
 
 @dataclass(frozen=True)
 class Reply:
-    """One answer."""
-
     text: str
     usage: Usage | None  # None if not reported
     structured: str  # how its form was enforced: json_schema, plain, or native (written by rules)

@@ -170,8 +170,6 @@ class Refusal(Exception):
 
 @dataclass(frozen=True)
 class Response:
-    """A response of a server."""
-
     status: int
     body: bytes
     is_cut: bool = False  # the body exceeds the size limit

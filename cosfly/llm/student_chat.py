@@ -100,7 +100,12 @@ def encoded_image(rgb: np.ndarray, encoding: Literal["jpeg", "png"] = "jpeg") ->
 def student_request(
     prompt: Prompt, frames: Sequence[Sequence[EncodedImage]], schema: dict, sampling: EndpointConfig, seed: int = 0
 ) -> Request:
-    """Return a request to an engine. frames: Pictures of each frame, oldest first. schema: That of the answer."""
+    """Return a request to an engine.
+
+    Args:
+        frames: Pictures of each frame, oldest first.
+        schema: JSON schema of the answer.
+    """
     parts = [[{"type": "image_url", "image_url": {"url": picture.url}} for picture in pictures] for pictures in frames]
     digests = [picture.digest for pictures in frames for picture in pictures]
     return sampling.request(chat_messages(prompt, parts), digests, schema, seed)

@@ -47,7 +47,8 @@ class VllmEngine:
         """
         Args:
             sampling: sampling settings, checked before the model is loaded.
-            num_images: most pictures of one request. settings: section of `vllm` and `endpoint`, for messages.
+            num_images: most pictures of one request.
+            settings: section of `vllm` and `endpoint`, for messages.
         """
         if not (folder / "config.json").is_file():
             fix = "pass vllm:MODEL_DIR with the folder of a model"

@@ -169,9 +169,7 @@ class _Skipped(Exception):
 
 
 @dataclass
-class _Made:
-    """The boxes of all rows."""
-
+class _BoxesOfRows:
     boxes: BoxList = field(default_factory=BoxList)
     row_of_box: list[int] = field(default_factory=list)  # index of the row of each box
     size_sources: Counter[str] = field(default_factory=Counter)  # number of boxes by the source of their sizes
@@ -242,9 +240,9 @@ def _read_rows(cfg: BoxesConfig, path: Path, *, is_table: bool) -> BoxMap:
     return box_map
 
 
-def _make_boxes(rows: list[_Row], cfg: BoxesConfig) -> _Made:
+def _make_boxes(rows: list[_Row], cfg: BoxesConfig) -> _BoxesOfRows:
     """Make the boxes of all rows, in metres; a row that cannot be used is counted."""
-    made = _Made()
+    made = _BoxesOfRows()
     boxes = made.boxes
     for part in shapely.get_parts([row.shape for row in rows if not row.problem]):
         if isinstance(part, Polygon):
@@ -262,7 +260,7 @@ def _make_boxes(rows: list[_Row], cfg: BoxesConfig) -> _Made:
     return made
 
 
-def _check_and_report(made: _Made, rows: list[_Row], ids: list[int], cfg: BoxesConfig, path: Path) -> None:
+def _check_and_report(made: _BoxesOfRows, rows: list[_Row], ids: list[int], cfg: BoxesConfig, path: Path) -> None:
     """Raise InputError if the ids are invalid or too many rows are; log what a user may want to correct."""
     dropped = made.dropped
     if len(set(ids)) < len(ids) or not all(0 <= box_id < 2**63 for box_id in ids):
@@ -294,7 +292,6 @@ def _ids_of(rows: Sequence[_Row]) -> list[int]:
 
 
 def _table_rows(cfg: BoxesConfig, path: Path) -> list[_Row]:
-    """Read the rows of a CSV table."""
     reader = csv.reader(io.StringIO(read_text(path, what="table of boxes").removeprefix("\ufeff")), strict=True)
     try:
         lines = [(f"line {reader.line_num}", [cell.strip() for cell in line]) for line in reader]
@@ -318,13 +315,17 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> list[_Row]:
 def _table_row(where: str, names: Sequence[str], cells: Sequence[str]) -> _Row:
     values = {name: cell for name, cell in zip(names, cells, strict=False) if cell}
     position = {name: _number(values.get(name)) for name in ("x_m", "y_m")}
-    problem = "" if len(cells) == len(names) else f"{len(cells)} cells, but the first line has {len(names)}"
+    problems = []
+    if len(cells) != len(names):
+        problems.append(f"{len(cells)} cells, but the first line has {len(names)}")
     for name, number in position.items():
-        if not problem and math.isnan(number):
-            problem = (
-                f"{name} is not a finite number: {values[name][:40]!r}" if name in values else f"{name} is missing"
-            )
-    return _Row(where, values, Point() if problem else Point(*position.values()), problem, "bad_value")
+        if name not in values:
+            problems.append(f"{name} is missing")
+        elif math.isnan(number):
+            problems.append(f"{name} is not a finite number: {values[name][:MOST_NAME]!r}")
+    if problems:
+        return _Row(where, values, problem=problems[0], reason="bad_value")
+    return _Row(where, values, Point(*position.values()))
 
 
 def _feature_rows(cfg: BoxesConfig, path: Path) -> tuple[list[_Row], Units]:
@@ -499,7 +500,7 @@ def _kind_of(row: _Row, cfg: BoxesConfig) -> str:
     if kind in TYPES:
         return kind
     if cfg.is_plain:
-        raise _Skipped("unknown_type", f"unknown type {name[:40]!r}{nearest(name, [*TYPES, *cfg.types])}")
+        raise _Skipped("unknown_type", f"unknown type {name[:MOST_NAME]!r}{nearest(name, [*TYPES, *cfg.types])}")
     for rule in TYPE_RULES:
         if rule.covers(column, name, row.shape.geom_type):
             if rule.kind in TYPES:
@@ -507,9 +508,10 @@ def _kind_of(row: _Row, cfg: BoxesConfig) -> str:
             break  # such features have no boxes
     if not name:
         properties = ", ".join(row.values)[:80] or "none"
-        words = f"maps.boxes.type_column names no property of this feature, which has {properties}"
-        raise _Skipped("unmapped_type", words)
-    raise _Skipped("unmapped_type", f"there is no type for {column}={name[:40]!r}; maps.boxes.types can name one")
+        problem = f"maps.boxes.type_column names no property of this feature, which has {properties}"
+    else:
+        problem = f"there is no type for {column}={name[:MOST_NAME]!r}; maps.boxes.types can name one"
+    raise _Skipped("unmapped_type", problem)
 
 
 def _size_of(row: _Row, kind: str, cfg: BoxesConfig) -> _Size:
@@ -541,7 +543,7 @@ def _size_of(row: _Row, kind: str, cfg: BoxesConfig) -> _Size:
         is_slab = is_slab or ("height_m" not in numbers and height_m == SLAB_M)
         numbers = defaults | numbers
     problems = [f"{name} is missing" for name in needed if name not in numbers and name not in not_finite]
-    problems += [f"{name} is not a finite number: {str(row.values[name])[:40]!r}" for name in not_finite]
+    problems += [f"{name} is not a finite number: {str(row.values[name])[:MOST_NAME]!r}" for name in not_finite]
     problems += [f"{name} must be above 0" for name in needed if numbers.get(name, 1.0) <= 0]
     if above_m and numbers.get("height_m", math.inf) <= above_m:
         problems.append(f"height_m must be above the minimum height, {above_m:g} m")

@@ -63,8 +63,6 @@ RULES = [ObjectRule(**fields) for fields in read_yaml(Path(__file__).with_name("
 
 
 class CityObject(NamedTuple):
-    """One object."""
-
     object_id: str
     rule: ObjectRule
     surfaces: list[Surface]  # of the coarsest geometry with a height; boxes are made of them

@@ -82,7 +82,8 @@ def _texts(declared: Any) -> list[str]:
 def seen_units(places: np.ndarray, sizes: np.ndarray) -> Units | None:
     """Return what coordinates look like, m or degrees; None if they may be both.
 
-    places: (n, 2). sizes: (k,), the length of each outline, or the distance of a point to the nearest other one.
+    places: (n, 2).
+    sizes: (k,), the length of each outline, or the distance of a point to the nearest other one.
     """
     middle = float(np.median(sizes[sizes > 0])) if (sizes > 0).any() else math.inf
     if (np.abs(np.median(places, axis=0)) > [180.0, 90.0]).any() or middle > SMALLEST_M:

@@ -85,7 +85,9 @@ def _place(
 def avoid_collisions(route: TimedRoute, time_s: np.ndarray, placed_m: np.ndarray) -> np.ndarray | None:
     """Return the positions, (n, 2) m, on a route with waits for people already placed; None if these do not help.
 
-    time_s: (n,) on the route. placed_m: (e, n, 2), positions of those people then.
+    Args:
+        time_s: (n,) on the route.
+        placed_m: (e, n, 2), the positions of the others at these times.
     """
     for _ in range(MOST_WAITS + 1):
         along_m, _ = route.sample(time_s)
@@ -106,7 +108,8 @@ def gaps_m(positions_m: np.ndarray, placed_m: np.ndarray) -> np.ndarray:
     All move straight within a step, so that a distance of two people is that of the origin from a segment of offsets.
 
     Args:
-        positions_m: (n, 2). placed_m: (e, n, 2), the others at the same times.
+        positions_m: (n, 2).
+        placed_m: (e, n, 2), the others at the same times.
     """
     # (2, e, n): reductions over an axis of two numbers are slow where it is the last.
     offsets_m = np.ascontiguousarray(np.moveaxis(positions_m - placed_m, 2, 0))

@@ -55,7 +55,6 @@ class Editor:
             self.digest = sha256_bytes(data)
 
     def page_html(self) -> str:
-        """Return the page."""
         folder = Path(__file__).parent
         ground = self.whole_ground
         grid = ground.grid

@@ -56,8 +56,6 @@ CAPTION = "dark: obstacles, grey: margin, blue: walkable, violet: carriageway, y
 
 
 class PedestrianResult(NamedTuple):
-    """One trajectory."""
-
     trajectory: PedestrianTrajectory
     num_rejected: dict[str, int]  # pairs of ends, by RETRY_REASONS
     seconds: dict[str, float]  # by step

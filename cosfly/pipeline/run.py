@@ -169,7 +169,6 @@ def _check_files(cfg: RunConfig) -> None:
 
 
 def _run_town(cfg: RunConfig, out: Path, town_stages: list[Stage]) -> list[StageResult]:
-    """Run the stages of one town."""
     with _run_directory(cfg, out):
         results = [_run_stage(stage, out, f"{k}/{len(town_stages)}") for k, stage in enumerate(town_stages, 1)]
         viewer = out / "viewer.html"  # written last: current if it is newer than all manifests

@@ -27,8 +27,6 @@ PAGES = ("viewer.html", "contact_sheet.png", "inspect/report.html", "caption/rep
 
 @dataclass(frozen=True)
 class StageSummary:
-    """One stage of a run."""
-
     name: str  # `stage`, or `town/stage` in a run with towns
     folder: Path
     state: Literal["complete", "begun", "to do"]
@@ -48,8 +46,6 @@ class StageSummary:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """One run directory."""
-
     cfg: RunConfig
     stages: list[StageSummary]
 
@@ -72,7 +68,6 @@ class RunSummary:
 
 
 def summarize(run: Path) -> RunSummary:
-    """Return the summary of a run directory."""
     if not (run / "run.yaml").is_file():
         what = "the folder is not a run directory"
         expected = "a directory that `cosfly run` wrote"
@@ -132,8 +127,6 @@ SMALL_SHARE = 0.2  # of the time
 
 @dataclass(frozen=True)
 class StageEstimate:
-    """The estimate of one stage."""
-
     name: str
     count: int  # of its units
     seconds: float | None  # None if they depend on the teacher; 0 if the stage is complete

@@ -166,7 +166,14 @@ def changed(cfg: BaseModel, section: str | None = None) -> list[Setting]:
 def _explain(
     group: Mapping[str, Any], models: Mapping[str, Any], values: Mapping[str, Any], above: str
 ) -> Iterator[Setting]:
-    """Yield the settings of a group. group: its schema. models: schemas by name. above: its name and a dot."""
+    """Yield the settings of a group.
+
+    Args:
+        group: Its schema.
+        models: Schemas by name.
+        values: Its values.
+        above: Its name and a dot.
+    """
     for name, field in group["properties"].items():
         meaning = field.get("description", "")
         model = _referenced(field, models)

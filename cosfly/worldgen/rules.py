@@ -225,7 +225,7 @@ class _Reader:
     def _take_objects(self) -> dict[str, int]:
         """Take the objects of the table; return their counts."""
         counts: dict[str, int] = {}
-        names = {word: thing.name for thing in OBJECTS.values() for word in (thing.name, *thing.words)}
+        names = {word: obj.name for obj in OBJECTS.values() for word in (obj.name, *obj.words)}
         for word in _longest_first(names):
             name = names[word]
             while (count := self._take_counted(word, SEVERAL)) is not None:

@@ -195,7 +195,7 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     if problems := _problems(checks, town, trace):
         log.warning("%s", problems)
     if town.placed:
-        log.info("placed: %s", counts_text(Counter(thing.name for thing in town.placed)))
+        log.info("placed: %s", counts_text(Counter(obj.name for obj in town.placed)))
     num_kept = 1 + len(town.placed)
     dropped = Counter(reason.replace(" ", "_") for _, reason in town.not_placed)
     tally = Tally(input=num_kept + len(town.not_placed), kept=num_kept, dropped=dropped)
@@ -211,10 +211,10 @@ def _picture(town: Town, plan: WorldPlan) -> bytes:
     view = TopView.around(np.stack(town.boxes.bounds()), PICTURE_PX)
     picture = draw_map(town.boxes, view)
     block_names = ["plaza"] * plan.plazas + ["green"] * plan.greens  # in the order of the open blocks
-    things = [thing for thing in town.placed if OBJECTS[thing.name].where != "layout"]
-    labels = [(thing.name, thing.xy) for thing in things if thing.number == 0]
+    objects = [obj for obj in town.placed if OBJECTS[obj.name].where != "layout"]
+    labels = [(obj.name, obj.xy) for obj in objects if obj.number == 0]
     for name, block in zip(block_names, town.open_blocks, strict=False):
-        if not any(block.covers(shapely.Point(thing.xy)) for thing in things):
+        if not any(block.covers(shapely.Point(obj.xy)) for obj in objects):
             labels.append((name, block.centroid.coords[0]))
     for name, xy in labels:
         draw_text(picture, name, *view.pixels(np.array([xy]))[0], align=0.5, halo=HALO)
@@ -237,7 +237,7 @@ def _write_world(town: Town, out: Path) -> None:
     placed = placement_nodes(town)
     write_json(out / "layout.json", {"nodes": layout}, indent=None)
     missing = [{"name": name, "reason": reason} for name, reason in town.not_placed]
-    placement = {"nodes": placed, "placed": [thing._asdict() for thing in town.placed], "not_placed": missing}
+    placement = {"nodes": placed, "placed": [obj._asdict() for obj in town.placed], "not_placed": missing}
     write_json(out / "placement.json", placement)
     width, height = map(round, town.size_m)
     base = {"name": town.name, "env_bin": "", "width": width, "height": height}

@@ -397,7 +397,8 @@ def _furnish(
 ) -> None:
     """Add paint to a street, with crossings at junctions and evenly between them, and furniture.
 
-    has_crossings: (2,) whether there is a crossing at its start and at its end. parked_share: None adds no furniture.
+    has_crossings: (2,) whether there is a crossing at its start and at its end.
+    parked_share: of parking places that are taken; None adds no furniture.
     """
     low, high = clear
     edge = street.road_m / 2 if street.road_m else street.width_m / 2 - LANE_EDGE_M

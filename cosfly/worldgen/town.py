@@ -53,8 +53,6 @@ Size = tuple[float, ...]
 
 
 class Placed(NamedTuple):
-    """One placed object."""
-
     name: str
     number: int  # among the objects of the name
     xy: tuple[float, float]  # middle, m
@@ -78,7 +76,7 @@ def build(plan: WorldPlan, name: str, seed: int) -> Town:
 
     A town without a size is as large as its blocks, or, where all buildings are counted, as these need.
     """
-    widest_m = max((max(thing.size_m) * thing.least_scale for thing, _ in plan.known_objects()), default=0.0)
+    widest_m = max((max(obj.size_m) * obj.least_scale for obj, _ in plan.known_objects()), default=0.0)
     plan = plan.model_copy(update={"block_m": max(plan.block_m, min(widest_m + 2 * SPACE_M, WIDEST_BLOCK_M))})
     if plan.size_m:
         return Town(plan, plan.size_m, name, seed)
@@ -156,8 +154,8 @@ class Town:
         self._paved = shapely.STRtree([*self._strips, *self._pave_open_blocks()])  # where paths to doors begin
         self._buildable = shapely.difference(self._buildable, shapely.union_all(self.open_blocks).buffer(0.1))
         shapely.prepare(self._buildable)
-        for thing, count in sorted(plan.known_objects(), key=lambda pair: -math.prod(pair[0].size_m)):
-            self._place_object(thing, count)
+        for obj, count in sorted(plan.known_objects(), key=lambda pair: -math.prod(pair[0].size_m)):
+            self._place_object(obj, count)
         self._build_houses()
         if plan.setback_m < GARDEN_SETBACK_M:
             for block in self._closed_blocks:
@@ -204,7 +202,7 @@ class Town:
         """Return plazas, the blocks nearest to the middle, then greens; one if only an object needs it."""
         plan = self.plan
         rng = rng_for(self.seed, "world", "open")
-        has_objects = any(thing.where == "open" for thing, _ in plan.known_objects())
+        has_objects = any(obj.where == "open" for obj, _ in plan.known_objects())
         num_open = max(plan.plazas + plan.greens, int(has_objects))
         blocks = self._closed_blocks[: max(1, len(self._closed_blocks) // 2)]
         num_plazas = plan.plazas or int(has_objects and not plan.greens)
@@ -299,52 +297,52 @@ class Town:
 
     # --- objects ---
 
-    def _place_object(self, thing: Object, count: int) -> None:
+    def _place_object(self, obj: Object, count: int) -> None:
         """Place an object `count` times: in open blocks, at a street or in the water."""
-        if thing.where == "layout":
+        if obj.where == "layout":
             num_built = min(count, len(self.network.bridges))
-            self.placed += [Placed(thing.name, number, (0.0, 0.0), 0.0, 1.0) for number in range(num_built)]
-            self.not_placed += [(thing.name, "no street to carry it")] * (count - num_built)
+            self.placed += [Placed(obj.name, number, (0.0, 0.0), 0.0, 1.0) for number in range(num_built)]
+            self.not_placed += [(obj.name, "no street to carry it")] * (count - num_built)
             return
-        scales = [scale for scale in SCALES if scale >= thing.least_scale - 1e-9]
+        scales = [scale for scale in SCALES if scale >= obj.least_scale - 1e-9]
         for number in range(count):
-            scaled_place = self._find_place(thing, scales)
+            scaled_place = self._find_place(obj, scales)
             if scaled_place is None:
-                may_exist = thing.where == "open" or not self.network.water.is_empty
-                self.not_placed.append((thing.name, "no room" if may_exist else "no water in the plan"))
+                may_exist = obj.where == "open" or not self.network.water.is_empty
+                self.not_placed.append((obj.name, "no room" if may_exist else "no water in the plan"))
                 continue
             place, scale = scaled_place
-            _add_object(self._objects, thing, place, scale)
-            node = f"OBJ_{thing.name.replace(' ', '_')}_{number}"
-            self.object_nodes += [(node, thing.asset)] * len(thing.parts)
-            if any(part.kind == "Buildings" for part in thing.parts):
+            _add_object(self._objects, obj, place, scale)
+            node = f"OBJ_{obj.name.replace(' ', '_')}_{number}"
+            self.object_nodes += [(node, obj.asset)] * len(obj.parts)
+            if any(part.kind == "Buildings" for part in obj.parts):
                 self._add_path(self._objects, place)
             self.object_nodes += [("way", None)] * (len(self._objects) - len(self.object_nodes))
-            self.placed.append(Placed(thing.name, number, place.center, place.yaw_deg, scale))
+            self.placed.append(Placed(obj.name, number, place.center, place.yaw_deg, scale))
             self._taken.append(rectangle_polygon(place))
 
-    def _find_place(self, thing: Object, scales: list[float]) -> tuple[Rectangle, float] | None:
+    def _find_place(self, obj: Object, scales: list[float]) -> tuple[Rectangle, float] | None:
         """Return the outline and the scale of an object where there is room, else None."""
-        if thing.where == "water":
+        if obj.where == "water":
             bridges = shapely.union_all([
                 rectangle_polygon(bridge.rectangle((0.0, bridge.length_m), (-bridge.width_m, bridge.width_m)))
                 for bridge in self.network.bridges
             ])  # fmt: skip
-            return self._place_in(thing, shapely.difference(self.network.water, bridges), scales, 0.0)
+            return self._place_in(obj, shapely.difference(self.network.water, bridges), scales, 0.0)
         for block in self.open_blocks:
-            scaled_place = self._place_in(thing, block, scales, oriented_rectangle(block).yaw_deg)
+            scaled_place = self._place_in(obj, block, scales, oriented_rectangle(block).yaw_deg)
             if scaled_place is not None:
                 return scaled_place
         for scale in scales:
-            size = thing.size_m[0] * scale, thing.size_m[1] * scale
-            lots = self._lots([size], rng_for(self.seed, "world", thing.name), setback_m=self.plan.setback_m)
+            size = obj.size_m[0] * scale, obj.size_m[1] * scale
+            lots = self._lots([size], rng_for(self.seed, "world", obj.name), setback_m=self.plan.setback_m)
             lot = next(lots, None)
             if lot is not None:
                 return lot, scale
         return None
 
     def _place_in(
-        self, thing: Object, area: BaseGeometry, scales: list[float], yaw_deg: float
+        self, obj: Object, area: BaseGeometry, scales: list[float], yaw_deg: float
     ) -> tuple[Rectangle, float] | None:
         """Return a place and the scale of an object in an area, along its yaw or across, near the middle; else None."""
         if area.is_empty:
@@ -358,9 +356,9 @@ class Town:
         centers = np.stack([x.ravel(), y.ravel()], axis=1)
         away_m = np.hypot(*(centers - np.array(turned.centroid.coords[0])).T)
         x, y = centers[np.argsort(away_m, kind="stable")].T
-        turns_deg = (0.0, 90.0) if thing.where == "open" else (0.0,)
+        turns_deg = (0.0, 90.0) if obj.where == "open" else (0.0,)
         for scale in scales:
-            wide, deep = (side * scale for side in thing.size_m)
+            wide, deep = (side * scale for side in obj.size_m)
             for turn_deg in turns_deg:
                 half_x, half_y = (wide / 2, deep / 2) if turn_deg == 0 else (deep / 2, wide / 2)
                 outlines = shapely.box(x - half_x, y - half_y, x + half_x, y + half_y)
@@ -404,10 +402,10 @@ class Town:
         return boxes.box_map()
 
 
-def _add_object(boxes: BoxList, thing: Object, place: Rectangle, scale: float) -> None:
+def _add_object(boxes: BoxList, obj: Object, place: Rectangle, scale: float) -> None:
     """Add an object's boxes; the heights of its high parts are scaled like its footprint."""
     placed = boxes.framed(place.center, place.yaw_deg)
-    for part in thing.parts:
+    for part in obj.parts:
         tall = scale if part.high > 1.0 else 1.0
         center, size = (scale * part.x, scale * part.y), (part.wide * scale, part.deep * scale)
         placed.add(part.kind, center, size, min(part.low, part.low * tall), part.high * tall)
