@@ -114,7 +114,7 @@ class RayTransport:
                 if self._ray.wait([self._started], timeout=WAITING_S)[0]:
                     self.node, self.pid, problem = self._ray.get(self._started)
                     if problem:
-                        raise EnvironmentMissing(where=f"node {self.node}", **problem)
+                        raise EnvironmentMissing(**problem)  # the pool adds the node
                 elif self._worker_index == 0:
                     log.warning("worker 0 waits until a node has %s free; run `ray status` for details", self._needs)
             self._call = self._host.exchange.remote(data)

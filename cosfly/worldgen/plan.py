@@ -82,7 +82,7 @@ class Buildings(Record):
     """Buildings of one kind."""
 
     name: str = Field(description="what they are called, such as warehouse")
-    count: int | None = Field(None, ge=1, le=1000)  # null: as many of them as there is room for
+    count: int | None = Field(None, ge=1, le=1000, description="how many; null: as many as there is room for")
     footprint_m: Range = Field((12.0, 30.0), description="sides of buildings")
     heights_m: Range = Field((8.0, 24.0), description="heights of buildings")
 
