@@ -219,12 +219,10 @@ class Scorer:
             tokenizer.model_max_length = config.max_position_embeddings - 2
         limit = tokenizer.model_max_length
         self.metric = Metric(
-            model="/".join(folder.absolute().parts[-2:]),
-            layer=layer,
-            max_tokens=limit,
+            model="/".join(folder.absolute().parts[-2:]), layer=layer, max_tokens=limit,
             cut=sum(len(tokenizer(text, truncation=False)["input_ids"]) > limit for text in references),
             versions={name: version(name) for name in ("bert-score", "torch", "transformers")},
-        )
+        )  # fmt: skip
 
     def score(self, candidates: Mapping[str, Sequence[str]], references: Sequence[str]) -> dict[str, np.ndarray]:
         """Score several authors' texts; return author -> precision, recall, F1, (n, 3), 0 for an empty text."""

@@ -60,14 +60,10 @@ def generate(
     # Under autocast keys and values may be of different types, which a static cache does not hold.
     is_one_type = core.get_input_embeddings().weight.dtype == student.dtype
     config = GenerationConfig(
-        do_sample=False,
-        max_new_tokens=max_tokens,
-        eos_token_id=end,
-        pad_token_id=pad,
-        stop_strings=stop or None,
+        do_sample=False, max_new_tokens=max_tokens, eos_token_id=end, pad_token_id=pad, stop_strings=stop or None,
         cache_implementation="static" if is_one_type else "dynamic",
         disable_compile=True,  # a compiled step holds for one batch size and length, and costs a minute
-    )
+    )  # fmt: skip
     core.generation_config = config  # settings for sampling of the model folder would complete those of `config`
     student.model.eval()
     with torch.inference_mode(), student.computing(), with_encoded_pictures(student, features) as picture_inputs:

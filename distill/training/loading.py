@@ -67,13 +67,9 @@ def in_order(function: Callable[[ItemT], ResultT], items: Sequence[ItemT], max_w
     workers = min(max_workers, len(items) // SAMPLES_PER_WORKER)
     loader: Any = torch.utils.data.DataLoader(
         _Computed(function),  # type: ignore[arg-type]  # a loader without batches needs nothing else
-        batch_size=None,
-        sampler=items,
-        num_workers=workers,
-        worker_init_fn=partial(_start_worker, os.getpid()),
-        multiprocessing_context="fork" if workers else None,
-        collate_fn=lambda result: result,
-    )
+        batch_size=None, sampler=items, num_workers=workers, worker_init_fn=partial(_start_worker, os.getpid()),
+        multiprocessing_context="fork" if workers else None, collate_fn=lambda result: result,
+    )  # fmt: skip
     for result in loader:
         if isinstance(result, CosflyError):
             raise result

@@ -126,11 +126,9 @@ def processes(cfg: TrainConfig, out: Path) -> Iterator[Any]:
         raise EnvironmentMissing(words, where=where, got=missing[0], expected=expected, fix=fix)
     device = pick_device(cfg.device)
     accelerator = Accelerator(
-        cpu=device == "cpu",
-        log_with=list(cfg.report_to) or None,
-        project_dir=out / "curves",
+        cpu=device == "cpu", log_with=list(cfg.report_to) or None, project_dir=out / "curves",
         kwargs_handlers=[InitProcessGroupKwargs(timeout=PATIENCE)],
-    )
+    )  # fmt: skip
     if not accelerator.is_main_process:
         logging.getLogger("distill").setLevel(logging.WARNING)
     is_finished = False
