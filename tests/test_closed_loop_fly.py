@@ -17,6 +17,7 @@ from caption.schema import CaptionConfig
 from caption.stage.stage import run as caption_tree
 from cosfly.closed_loop.settings import Drone
 from cosfly.closed_loop.stepper import ClosedLoopTrajectory
+from cosfly.formats.bystanders import read_bystanders
 from cosfly.formats.captions import read_captions
 from cosfly.formats.episodes import EPISODES, Episode, read_episode
 from cosfly.formats.playback_file import read_track
@@ -97,6 +98,25 @@ def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(t
     assert asked
     same = [caption.en.flight_decision == decided[caption.sample_id] for caption in asked if caption.en]
     assert np.mean(same) == 1.0
+
+
+@pytest.mark.slow
+def test_bystanders_walk_as_long_as_an_episode_lasts(town, tmp_path, in_this_process):
+    made = tmp_path / "pedestrians"
+    obeyed(
+        f"pedestrians {TINY} --workers 1 --map {town}/simplify/step2_simplified.json --out {made} "
+        "--set pedestrians.others=2 --set pedestrians.num_paths=1"
+    )
+    given = f"--map {town}/maps/boxes_3d.json --paths {made}/path.json --others {made}/others.json"
+    lost = "--student random --workers 1 --set fly.most_decisions=12"
+    done = obeyed(f"fly {TINY} {given} --simplified {town}/simplify/step2_simplified.json --out {tmp_path}/fly {lost}")
+    (path,) = (tmp_path / "fly" / EPISODES).glob("*.json")
+    (bystanders,) = read_bystanders(made / "others.json")
+    num_frames = len(read_episode(path).frames)
+    assert all(num_frames < len(bystander.positions_m) for bystander in bystanders.others)
+    (folder,) = find_tracks(tmp_path / "fly/render")
+    assert len(read_track(folder).positions_m) == num_frames
+    assert "1 kept of 1" in done
 
 
 @pytest.mark.slow

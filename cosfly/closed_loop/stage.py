@@ -288,10 +288,11 @@ def open_map(
     )  # fmt: skip
 
     def open_episode(n: int) -> ClosedLoopTrajectory:
+        plan = _cut(traces[n], cfg.fly)
+        others = [bystander.until(len(plan.time_s)) for bystander in bystanders.get(plan.path_id, ())]
         return ClosedLoopTrajectory(
-            airspace, _cut(traces[n], cfg.fly), number=n, num_lead=cfg.fly.lead_frames, lost_s=cfg.fly.lost_s,
-            others=bystanders.get(traces[n].path_id, ()),
-        )  # fmt: skip
+            airspace, plan, number=n, num_lead=cfg.fly.lead_frames, lost_s=cfg.fly.lost_s, others=others
+        )
 
     return open_episode
 

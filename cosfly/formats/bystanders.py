@@ -39,6 +39,10 @@ class Bystander:
         """Return the bystander at one time."""
         return replace(self, positions_m=self.positions_m[i : i + 1], headings_rad=self.headings_rad[i : i + 1])
 
+    def until(self, end: int) -> Bystander:
+        """Return the bystander before time `end`."""
+        return replace(self, positions_m=self.positions_m[:end], headings_rad=self.headings_rad[:end])
+
     def every(self, stride: int) -> Bystander:
         """Return the bystander at every `stride`-th time."""
         return replace(self, positions_m=self.positions_m[::stride], headings_rad=self.headings_rad[::stride])

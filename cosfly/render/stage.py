@@ -241,7 +241,10 @@ class _RenderedTrack(BaseModel):
 
 
 def bystanders_of(others: Path | None, traces: list[DroneTrace]) -> tuple[dict[str, list[Bystander]], int]:
-    """Read the bystanders of every trajectory, by path id, and the greatest number of bystanders of one trajectory."""
+    """Read the bystanders of every trajectory, by path id, and the greatest number of bystanders of one trajectory.
+
+    Those of a flown trajectory are cut to its length, because an episode may end before its pedestrian trajectory.
+    """
     if others is None:
         return {}, 0
     bystanders = {path.path_id: path.others for path in read_bystanders(others)}
@@ -249,13 +252,16 @@ def bystanders_of(others: Path | None, traces: list[DroneTrace]) -> tuple[dict[s
         where = f"{others}: {trace.path_id}"
         if trace.path_id not in bystanders:
             raise InputError("the file has no bystanders for the drone trajectory", where=where, fix=FROM_ONE_RUN)
+        num_times = len(trace.time_s)
+        if "ended" in trace.solver:
+            bystanders[trace.path_id] = [bystander.until(num_times) for bystander in bystanders[trace.path_id]]
         for bystander in bystanders[trace.path_id]:
-            if len(bystander.positions_m) != len(trace.time_s):
+            if len(bystander.positions_m) != num_times:
                 raise InputError(
                     "a bystander has more or fewer positions than the drone trajectory",
                     where=where,
                     got=f"{len(bystander.positions_m)} positions",
-                    expected=f"{len(trace.time_s)} positions",
+                    expected=f"{num_times} positions",
                     fix=FROM_ONE_RUN,
                 )
     return bystanders, max(map(len, bystanders.values()), default=0)
