@@ -46,7 +46,7 @@ def main() -> None:
             server = open_editor(root / "simple.json", PedestriansConfig(), root / "roi.json", 0)
             listens_s = time.perf_counter() - start
             threading.Thread(target=server.serve, daemon=True).start()
-            size = "{} x {}".format(*server.site.bare.grid.size)
+            size = "{} x {}".format(*server.site.whole_ground.grid.size)
             print(f"editor, {size} cells: listens after {listens_s:.2f} s, page after ", end="")
             print(f"{opened_s(page, server.address):.2f} s", flush=True)
             server.http.shutdown()
