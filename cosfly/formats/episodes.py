@@ -123,7 +123,7 @@ class Figure(Record):
         if self.value is None:
             return "-"
         text = f"{self.value:{digits}}"
-        if self.low is None or self.high is None or self.low >= self.high:
+        if self.low is None or self.high is None or not self.low < self.high:
             return text
         return f"{text} ({self.low:{digits}} to {self.high:{digits}})"
 

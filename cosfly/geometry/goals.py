@@ -161,6 +161,7 @@ def words_of(says: Sequence[str], looks: Appearance) -> Words:
     for name in says:
         if name in SIDES:
             side = SIDES[name].words
+            break
 
     def worn(slot: str, language: Language) -> str:
         color = getattr(looks, f"{slot}_color")

@@ -310,13 +310,15 @@ class _Comparison:
 
     def __init__(self, people: People, redraw: Callable[[int, Appearance], Frame], least_px: int) -> None:
         self.people = {PERSON_ID: people.target, **people.others}  # by instance id
-        self.frame = redraw(PERSON_ID, people.target)
-        self._redraw = redraw
+        self.frame = frame = redraw(PERSON_ID, people.target)
         self._least_px = least_px
-        self._differs = cache(self._redrawn_differs)  # the search asks for the same appearance again
 
-    def _redrawn_differs(self, instance_id: int, looks: Appearance) -> bool:
-        return people_differ(self.frame, self._redraw(instance_id, looks), instance_id, self._least_px)
+        # The search asks for the same appearance again. A cached method would keep this object alive, and its frame.
+        @cache
+        def differs(instance_id: int, looks: Appearance) -> bool:
+            return people_differ(frame, redraw(instance_id, looks), instance_id, least_px)
+
+        self._differs = differs
 
     def bystander_differs(self, slot: str, instance_id: int) -> bool:
         """Return whether a bystander looks unlike the target in a slot, or is too small to be seen."""

@@ -388,9 +388,11 @@ def _prepare_resume(out: Path, record: StageRecord, begun: Collection[str]) -> N
         # is written: without it, the other files would look foreign after a kill.
         for name in begun:
             path = out / name
+            if name == "stage.json":
+                continue
             if path.is_dir():
                 shutil.rmtree(path)
-            elif name != "stage.json":
+            else:
                 path.unlink(missing_ok=True)
 
 
