@@ -21,11 +21,12 @@ from toy_workers import stage_in
 
 from cosfly.formats.tracks import find_tracks
 from cosfly.pipeline import run as pipeline
+from cosfly.pipeline import runs
 from cosfly.pipeline.runs import estimate
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
 from cosfly.runtime.errors import ConfigError, ResumeError, VerifyError
-from cosfly.runtime.io import atomic_folder
+from cosfly.runtime.io import atomic_folder, write_bytes
 from cosfly.runtime.json_io import read_json, write_json
 from cosfly.runtime.run_dir import Tally, read_failures
 from release.verify.verify import verify
@@ -48,11 +49,25 @@ def careful(out: Path) -> None:
             (folder / f"{number}.txt").write_text("a frame")
 
 
+def impatient(out: Path) -> None:
+    """Refuses its own half."""
+    if any(out.iterdir()):
+        raise FileExistsError(out)
+    careful(out)
+
+
+def untidy(out: Path) -> None:
+    """Leaves what another process with its name could not know."""
+    write_bytes(out / f"{len(list(out.iterdir()))}.json", b"{}")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("work", "words"),
     [
         (careless, "product.json: b'{\"all\": '"),
+        (impatient, "exit 1"),
+        (untidy, "1.json: b'{}', not b'no file'"),
         (careful, None),
     ],
 )
@@ -156,6 +171,15 @@ def test_a_dry_run_writes_nothing(small_run):
     assert not beside.exists()
 
 
+def test_a_release_of_the_papers_shape_is_estimated(monkeypatch, tmp_path):
+    """250 trajectories of 618 to 770 frames, 400 of each: 100,000 frames a track."""
+    monkeypatch.setattr(runs, "num_frames", lambda cfg, out: [618 + i % 153 for i in range(250)])
+    release = estimate(tiny(), tmp_path)[-1]
+    assert (release.name, release.count) == ("release", 200_000)
+    clean = estimate(tiny(**{"render.tracks": ["clean"], "release.tracks": ["clean"]}), tmp_path)[-1]
+    assert clean.count == 100_000
+
+
 def test_a_finished_run_costs_nothing_more_and_an_unfinished_one_the_rest(small_run, tmp_path):
     assert all(row.is_done and row.seconds == 0 for row in estimate(tiny(), small_run))
     frames = sum(flight["num_frames"] for flight in read_json(small_run / "render/manifest.json")["flights"])
@@ -197,13 +221,19 @@ def test_other_settings_are_refused_by_name_and_nothing_is_touched(small_run, tm
     assert not (out / ".lock").exists(), "who failed holds nobody up"
 
 
+# Made for people, or the record of another file: nothing reads them as a product.
+UNBOUND = {
+    "run.yaml", "contact_sheet.png", "viewer.html", "stage.json", "manifest.json", "items.jsonl",
+    "failures.jsonl", "events.jsonl",
+}  # fmt: skip
 CHANGES = {
     "edited": lambda data, other: data[:-2] + bytes([data[-2] ^ 1]) + data[-1:],
     "cut": lambda data, other: data[: len(data) // 2],
     "emptied": lambda data, other: b"",
     "exchanged": lambda data, other: other,
 }
-# Which stages refuse a changed file when they begin; pictures: see below.
+# Which stages refuse a changed file when they begin. Those that are missing here read pictures: of them below.
+PICTURES = ("rgb.png", "depth_float32.png", "instance.png")
 REFUSED_BY = {
     "maps/boxes_Nd.json": ("simplify", "render"),
     "simplify/stepN_simplified.json": ("pedestrians", "plan", "render", "inspect"), "pedestrians/path.json": ("plan",),
@@ -219,7 +249,7 @@ REFUSED_BY = {
 
 def kinds_of(out: Path) -> dict[str, list[Path]]:
     kinds: dict[str, list[Path]] = {}
-    for path in sorted(p for p in out.rglob("*") if p.is_file()):
+    for path in sorted(p for p in out.rglob("*") if p.is_file() and p.name not in UNBOUND):
         kinds.setdefault(re.sub(r"\d+", "N", path.relative_to(out).as_posix()), []).append(path)
     return kinds
 
@@ -248,8 +278,8 @@ def test_a_changed_file_is_refused_by_the_stages_that_read_it(small_run, tmp_pat
 @pytest.mark.slow
 def test_no_changed_picture_reaches_a_release(small_run, tmp_path):
     out = begin(small_run, tmp_path / "run", "release")
-    flights, pictures = find_tracks(out / "render"), ("rgb.png", "depth_float32.png", "instance.png")
-    for flight, name in zip(flights[:3], pictures, strict=True):
+    flights = find_tracks(out / "render")
+    for flight, name in zip(flights[:3], PICTURES, strict=True):
         frames = flight / "frames_playback"
         shutil.copy(frames / "frame_00001" / name, frames / "frame_00000" / name)
     with pytest.raises(VerifyError, match="nothing is released"):
@@ -258,7 +288,7 @@ def test_no_changed_picture_reaches_a_release(small_run, tmp_path):
     assert messages
     for message in messages:  # each shard names its first problem
         assert "has changed since its digest was recorded" in message
-        assert any(f"frame_00000/{name}: the file" in message for name in pictures)
+        assert any(f"frame_00000/{name}: the file" in message for name in PICTURES)
     assert not (out / "release/dataset").exists()
     assert not (out / "release/manifest.json").exists()
 

@@ -12,6 +12,7 @@ import importlib.util
 import json
 import os
 import sys
+import threading
 import time
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -33,6 +34,7 @@ from cosfly.llm.client import EndpointConfig
 from cosfly.llm.contract import Reply, Request, started
 from cosfly.llm.vllm_engine import VllmEngine
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, StorageError, TeacherError
+from cosfly.runtime.journal import Journal
 from distill.inference import stage as infer
 from distill.schema import open_split
 
@@ -84,6 +86,26 @@ def test_what_is_kept_or_asked_by_another_is_not_asked_again(tmp_path):
 
 def answer_of(key: str) -> Answer:
     return Answer(key=key, sample_id="flight_frame_00004", purpose="free/0", text="{}", usage={"prompt_tokens": 10})
+
+
+def test_answers_that_wait_for_the_disk_share_one_sync(tmp_path, monkeypatch):
+    synced, all_wait = [], threading.Event()
+    monkeypatch.setattr(os, "fsync", synced.append)
+
+    async def put_all() -> None:
+        with AnswerBook(tmp_path) as book:
+            book._disk.submit(all_wait.wait, 60)
+            puts = [asyncio.create_task(book.put("flight", answer_of(str(i)))) for i in range(20)]
+            await asyncio.sleep(0)
+            assert not book.totals
+            puts[0].cancel()  # it is written, too
+            all_wait.set()
+            await asyncio.gather(*puts, return_exceptions=True)
+            assert book.totals == {"answers": 20, "prompt_tokens": 200}
+
+    asyncio.run(put_all())
+    assert len(synced) == 1
+    assert sum(1 for _ in Journal(tmp_path / "flight.jsonl").read()) == 20
 
 
 def test_an_answer_that_is_not_on_the_disk_is_not_counted(tmp_path, monkeypatch):

@@ -131,6 +131,11 @@ def test_a_planner_that_flies_into_a_tower_is_found_out(monkeypatch):
         plan_trajectory(walk_along("w", corners), kernels.obstacle_index(box_map), PlanConfig(planner="low"), 0)
 
 
+def test_an_unknown_planner_is_named():
+    with pytest.raises(ValueError, match="did you mean 'muco'"):
+        PlanConfig(planner="mucco")
+
+
 OPEN = kernels.obstacle_index(town_of())
 STRAIGHT = walk_along("straight", [(0, 0), (90, 0)])
 CAMERA = Camera(640, 360, intrinsic_matrix(640, 360, 60.0))
@@ -151,6 +156,13 @@ def pixels(drone, target, pitch, yaw):
 
 def rates_degps(yaw):
     return np.abs(wrap_deg(np.degrees(np.diff(yaw)))) / DT_S
+
+
+def test_a_direction_within_the_limit_stays_as_it_is():
+    pitch, yaw = look_at(*overhead(40.0))
+    limited = limit_yaw_rate(pitch, yaw, 60.0, DT_S)
+    assert limited[0] is pitch
+    assert limited[1] is yaw
 
 
 @pytest.mark.parametrize("aside_m", [0.5, -0.5, 1.0])
@@ -200,6 +212,13 @@ def test_a_plan_with_a_gimbal_flies_the_same_way_and_looks_elsewhere():
     assert np.abs(wrap_deg(loose.rotations_deg - other.rotations_deg)[:, 1]).max() > 3.0
 
 
+def test_new_settings_are_recorded_only_where_they_are_set():
+    assert not {"gimbal", "yaw_rate_max_degps"} & PlanConfig().recorded().keys()
+    recorded = PlanConfig(gimbal=GIMBAL, yaw_rate_max_degps=90.0).recorded()
+    assert recorded["yaw_rate_max_degps"] == 90.0
+    assert recorded["gimbal"]["bandwidth_hz"] == 0.2
+
+
 @pytest.mark.parametrize("correlation_s", [1.0, 6.0])
 def test_smooth_draws_have_the_stated_covariance(correlation_s):
     drawn = draw_smooth(100_000, 2, DT_S, correlation_s, np.random.default_rng(0))
@@ -219,6 +238,10 @@ def test_the_weights_are_those_of_the_papers_printed_scores():
     for score, *normalized in rows.values():
         assert np.dot(normalized, [weight for *_, weight in CRITERIA.values()]) == pytest.approx(score, abs=1e-4)
     assert list(CRITERIA) == ["visibility", "collision", "clearance"]
+
+
+def test_every_planner_has_its_group():
+    assert sorted(compare.GROUP_OF) == sorted(ALL_PLANNERS)
 
 
 @pytest.fixture(scope="module")
@@ -301,6 +324,16 @@ def test_axis_scores_are_the_papers():
         assert list(scores[name].values()) == pytest.approx(expected, abs=1e-3)
 
 
+def test_a_planner_that_collides_does_not_set_the_shortest_path_and_is_less_safe():
+    means = {name: figures(**row) for name, row in DELTAS_OF_PAPER.items()}
+    means["jerk"] = figures(five_ray_mean=0.624, length_m=84.4, jerk_rms_mps3=1.732, collision_fraction=0.002,
+        clearance_min_m=1.137)  # fmt: skip
+    scores = compare.axis_scores(means)
+    assert scores["spline"]["path_efficiency"] == 1.0
+    assert scores["jerk"]["path_efficiency"] == pytest.approx(1.016, abs=1e-3)
+    assert scores["jerk"]["safety"] == pytest.approx(0.227, abs=1e-3)
+
+
 def test_deltas_are_the_papers():
     table = compare.deltas(figures(**DELTAS_OF_PAPER["track_astar"]), figures(**DELTAS_OF_PAPER["muco"]))
     assert table["length_m"] == {"delta": -4.359, "relative_percent": pytest.approx(-4.005, abs=1e-3)}
@@ -330,3 +363,21 @@ def test_the_record_is_what_the_flights_are(canyon, tmp_path_factory):
         assert record["means"][planner]["collision_fraction"] == 0
         assert manifest["timings"][planner]["mean_ms"] > 0
     assert record["win_rates"]["muco"]["both_collision_free"] == {"count": 2, "of": 2, "rate": 1.0}
+
+
+def test_a_walk_that_one_planner_cannot_fly_is_counted(canyon, tmp_path, monkeypatch):
+    real = compare.plan_trajectory
+
+    def lame(walk, obstacles, cfg, *rest):
+        if walk.path_id == "b" and cfg.planner == "muco":
+            raise NoPathError("lame", where="b")
+        return real(walk, obstacles, cfg, *rest)
+
+    monkeypatch.setattr(compare, "plan_trajectory", lame)
+    record = json.loads(compare.run(CFG, *canyon, tmp_path / "out").read_text())
+    manifest = json.loads((tmp_path / "out/manifest.json").read_text())
+    assert manifest["counts"] == {"input": 3, "kept": 2, "dropped": {}, "failed": {"no_path": 1}}
+    assert record["infeasible"] == {"b": {"muco": "b: lame"}}
+    assert record["means"]["muco"]["collision_fraction"] == 0.5
+    assert record["win_rates"]["muco"]["both_collision_free"] == {"count": 1, "of": 1, "rate": 1.0}
+    assert record["win_rates"]["track_astar"]["both_collision_free"]["of"] == 2

@@ -10,6 +10,7 @@ import contextlib
 import functools
 import hashlib
 import multiprocessing
+import os
 import sys
 import weakref
 from dataclasses import replace
@@ -51,7 +52,7 @@ from cosfly.render.settings import SIMULATORS, RenderConfig
 from cosfly.render.stage import RENDERERS, open_renderer, run
 from cosfly.render.surfaces import layers_of
 from cosfly.runtime.config import build
-from cosfly.runtime.errors import EnvironmentMissing
+from cosfly.runtime.errors import EnvironmentMissing, RenderError
 from cosfly.viz.frame_views import PEDESTRIAN_RGB, read_view
 from specimens import map_of
 
@@ -234,6 +235,18 @@ def test_of_coplanar_surfaces_of_one_kind_always_the_same_one_is_seen(renderer_n
     assert seen == [[2]] * 4
 
 
+def test_depth_is_exact_far_from_the_world_origin(renderer_name):
+    offset = (84_000.0, -447_000.0, 120.0)  # a real city's national grid
+    renderer = opened(renderer_name, street(offset))
+    pose = pose_towards(np.add(VIEWS[0][0], offset), np.add(VIEWS[0][1], offset))
+    intrinsic = intrinsic_matrix(*SIZE, 60.0)
+    frame = renderer.render(pose, intrinsic, {})
+    depth, _, ids = traced(street(offset), plane_z_m(street(offset)), pose, intrinsic)
+    inner = away_from_silhouettes(depth, ids) & (depth < 60.0)
+    renderer.close()
+    assert np.abs(frame.depth - depth)[inner].max() < DEPTH_TOLERANCE_M
+
+
 FAR_OFF_M = np.array([50_000.137, -50_000.291, 0.0])  # no whole numbers, which single precision holds exactly
 
 
@@ -346,6 +359,14 @@ def test_a_person_under_a_tree_is_seen_from_the_side_and_hidden_from_above(rende
     assert 0.2 < seen["through"][0] < 0.95, "a stem hides a strip"
 
 
+def test_a_pose_that_is_not_finite_is_refused(renderer):
+    intrinsic = intrinsic_matrix(*SIZE, 60.0)
+    with pytest.raises(RenderError, match="not finite"):
+        renderer.render(np.full((4, 4), np.nan), intrinsic, {})
+    with pytest.raises(RenderError, match="not finite"):
+        renderer.render(np.eye(4), intrinsic + np.inf, {})
+
+
 def test_the_look_is_in_the_picture(renderer_name):
     brightness = []
     for look in (Look(), Look(exposure=0.3), Look(haze_m=10.0), Look(sun_elevation_deg=10.0)):
@@ -377,6 +398,19 @@ def test_another_process_gives_the_same_picture_and_closing_a_renderer_leaves_ot
     assert here == there, "see the tolerance at the top: on one machine and driver it is zero"
 
 
+def _growth_mib(name: str) -> float:
+    resident_mib = []
+    for _ in range(5):
+        _digest(open_renderer(name, street(), *SIZE))
+        resident_mib.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20)
+    return resident_mib[-1] - resident_mib[1]
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="asks Linux for the memory in use")
+def test_a_renderer_that_is_dropped_gives_its_memory_back(renderer_name, other_process):
+    assert other_process.apply(_growth_mib, (renderer_name,)) < 100.0, "three more, of 80 MiB and more each"
+
+
 def test_a_renderer_may_be_dropped_on_another_thread_in_the_midst_of_a_frame(monkeypatch):
     kept = opened("gl", street())
     here = _digest(kept)
@@ -396,6 +430,14 @@ def _digest(renderer) -> str:
 
 def _digest_in_process(name: str) -> str:
     return _digest(open_renderer(name, street(), *SIZE))
+
+
+def test_the_checker_of_this_file_can_fail():
+    pose, intrinsic = pose_towards(*VIEWS[0][:2]), intrinsic_matrix(*SIZE, 60.0)
+    depth, _, ids = traced(street(), -0.1, pose, intrinsic)
+    shifted = intrinsic + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    wrong, _, _ = traced(street(), -0.1, pose, shifted)
+    assert np.abs(wrong - depth)[away_from_silhouettes(depth, ids) & (depth < 60.0)].max() > DEPTH_TOLERANCE_M
 
 
 @pytest.fixture(scope="module")
@@ -449,6 +491,17 @@ def test_a_missing_extra_is_named(monkeypatch):
         open_renderer("pyrender", street(), *SIZE)
 
 
+def test_a_second_renderer_without_libraries_names_the_packages(monkeypatch):
+    pytest.importorskip("pyrender")
+
+    def fail(*_):
+        raise ImportError("Unable to load EGL library", "libEGL.so.1: cannot open shared object file")
+
+    monkeypatch.setattr(sys.modules["pyrender"], "OffscreenRenderer", fail)
+    with pytest.raises(EnvironmentMissing, match=r"EGL.*libEGL\.so\.1.*apt-get install libegl1 libgl1 libgl1-mesa-dri"):
+        open_renderer("pyrender", street(), *SIZE)
+
+
 BESIDE = PosedPerson(HIP + np.array([1.2, 0.6, 0.0]), 0.2, 0.4, 1.0, choose_clothes(np.random.default_rng(4)))
 APART = PosedPerson(HIP + np.array([-5.0, -1.0, 0.0]), 0.6, 0.0, 0.0, choose_clothes(np.random.default_rng(5)))
 OTHERS = {other_id(0): BESIDE, other_id(1): APART}
@@ -495,6 +548,16 @@ def test_who_stands_before_the_target_hides_it_and_is_told_from_the_map(renderer
     frame = renderer.render(behind, camera.intrinsic, {PERSON_ID: WALKER, **before})
     view = view_target(HIP, behind, camera)
     assert rendered_visibility(frame, HIP, view, behind, camera, ids) == (0.0, 0.0, 1.0)
+
+
+def test_nobody_else_has_the_ids_of_others(renderer_name):
+    boxes = map_of(("Buildings", (0.0, 4.0, 1.0), (1.0, 1.0, 1.0)), ids=[MAX_BOX_ID])
+    pose, intrinsic = pose_towards((0.0, -10.0, 3.0), (0.0, 2.0, 1.0)), intrinsic_matrix(*SIZE, 60.0)
+    renderer = opened(renderer_name, boxes, num_others=2)
+    other = replace(APART, hip_m=np.array([4.0, 0.0, 0.9]))
+    ids = np.unique(renderer.render(pose, intrinsic, {other_id(1): other}).ids)
+    renderer.close()
+    assert ids.tolist() == [NO_INSTANCE, 1, other_id(1)]
 
 
 def with_others(folder: Path, num: int, trace: DroneTrace) -> Path:

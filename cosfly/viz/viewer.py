@@ -302,8 +302,8 @@ def _maps(trees: list[Tree], tracks: list[dict[str, Any]]) -> dict[str, list[dic
     points_of: dict[str, list] = defaultdict(list)  # by name of the map, which is run/town
     for track in tracks:
         points_of[track["map"]] += [*track["drone_path"], *track["target_path"]]
-    boxes_of = {tree.run: tree.boxes for tree in trees}
-    paths = {name: boxes_of[name.partition("/")[0]] for name in points_of}
+    boxes_of = {tree.run: tree.boxes for tree in trees if tree.boxes is not None}
+    paths = {name: boxes_of.get(name.partition("/")[0]) for name in points_of}
     return {name: _boxes_near(read_boxes(path), points_of[name]) for name, path in paths.items() if path is not None}
 
 
