@@ -56,7 +56,8 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
 
     def record(sample_id: str, request: Request, reply: Reply) -> None:
         exchanges[sample_id].append((request, reply))
-        log.info("%s: answer %d: %s", sample_id, len(exchanges[sample_id]), for_terminal(reply.text, MOST_LOGGED))
+        number, problem = len(exchanges[sample_id]), _problem_of(reply)
+        log.info("%s: answer %d%s: %s", sample_id, number, problem, for_terminal(reply.text, MOST_LOGGED))
 
     async def ask() -> list[Caption | BaseException]:
         with AnswerBook(out / ANSWERS) as book:
@@ -122,8 +123,12 @@ def _question_lines(number: int, request: Request) -> Iterator[str]:
 
 def _answer_lines(number: int, reply: Reply) -> Iterator[str]:
     usage = reply.usage
-    facts = [f"{usage.prompt_tokens} tokens in, {usage.completion_tokens} out" if usage else "tokens not reported"]
-    if reason := find_object(reply.text, FIELDS, reply.finish_reason).reason:
-        facts.append(STRUCTURES.get(reason, reason.replace("_", " ")))
-    yield f"--- answer {number} ({', '.join(facts)}) ---"
+    tokens = f"{usage.prompt_tokens} tokens in, {usage.completion_tokens} out" if usage else "tokens not reported"
+    yield f"--- answer {number} ({tokens}{_problem_of(reply)}) ---"
     yield for_terminal(reply.text, LONGEST_LOG)
+
+
+def _problem_of(reply: Reply) -> str:
+    """Return why an answer has no JSON object, after a comma; "" if it has one."""
+    reason = find_object(reply.text, FIELDS, reply.finish_reason).reason
+    return f", {STRUCTURES.get(reason, reason.replace('_', ' '))}" if reason else ""

@@ -240,7 +240,8 @@ class _Examination:
         """Report that the largest prompt gets no answer in time, and what helps."""
         endpoint = self.cfg.endpoint
         detail = f"the largest prompt gets no answer within {endpoint.timeout_s:g} s"
-        if endpoint.json_schema:
+        answer_s = endpoint.max_tokens / self.tokens_per_s if self.tokens_per_s else 0.0
+        if endpoint.json_schema and answer_s <= endpoint.timeout_s:  # else it is too slow without a schema, too
             plain = await self._ask("the largest prompt without a JSON schema", self.largest, endpoint.max_tokens)
             if plain.reply is not None:
                 contrast = f"but one within {plain.seconds:.0f} s without a JSON schema"
@@ -248,7 +249,6 @@ class _Examination:
                 return
         longer_s = 2 * endpoint.timeout_s
         if self.tokens_per_s:
-            answer_s = endpoint.max_tokens / self.tokens_per_s
             speed = f"{self.tokens_per_s:.1f} tokens/s, as in the answer before"
             detail += f"; at {speed}, {endpoint.max_tokens} tokens take {answer_s:.0f} s"
             longer_s = max(longer_s, 2 * answer_s)  # as much again for the prompt

@@ -153,7 +153,9 @@ def summary_tables(product: Path) -> list[TextTable]:
     tables = []
     for language, part in report.languages.items():
         rows = [[name, *(_shown(key, own.figures[key]) for key in SUMMARY)] for name, own in part.who.items()]
-        title = f"{LANGUAGES[language]}: {part.samples} samples; all figures are in evaluation.html"
+        counts = f"samples: {part.samples}, pedestrian trajectories: {part.walks}"
+        counts += f", decisions of the teacher: {len(part.who[TEACHER].by_decision)}"
+        title = f"{LANGUAGES[language]} ({counts}); all figures are in evaluation.html"
         tables.append(TextTable(title, ["", *(FIGURES[key] for key in SUMMARY)], rows))
     return tables
 
