@@ -1,5 +1,6 @@
 """The report of an evaluation: `report.json`, and its tables as a page."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -147,17 +148,15 @@ def tables_of(report: Evaluation, language: Language) -> list[TextTable]:
     return tables
 
 
-def summary_tables(product: Path) -> list[TextTable]:
-    """Return the most important figures of a `report.json`, one table for each language."""
+def summary_tables(product: Path) -> Iterator[TextTable]:
+    """Yield the most important figures of a `report.json`, one table for each language."""
     report = read_model(product, Evaluation, REPORT_FORMAT)
-    tables = []
     for language, part in report.languages.items():
         rows = [[name, *(_shown(key, own.figures[key]) for key in SUMMARY)] for name, own in part.who.items()]
         counts = f"samples: {part.samples}, pedestrian trajectories: {part.walks}"
         counts += f", decisions of the teacher: {len(part.who[TEACHER].by_decision)}"
         title = f"{LANGUAGES[language]} ({counts}); all figures are in evaluation.html"
-        tables.append(TextTable(title, ["", *(FIGURES[key] for key in SUMMARY)], rows))
-    return tables
+        yield TextTable(title, ["", *(FIGURES[key] for key in SUMMARY)], rows)
 
 
 def notes_of(report: Evaluation) -> list[str]:
