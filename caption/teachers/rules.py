@@ -49,6 +49,7 @@ SIDES = (("left", "right"), ("left",), ("right",))  # sides of the picture, by t
 # The drone.
 DRIFTING_MPS = 0.2  # a slower one keeps its place
 SLOW_MPS = 0.3
+OPENING_M = 0.5  # change of the distance within a window that is worth a sentence
 SLIDING_MPS = 0.5  # motion to a side, and differences of speed, that are worth a sentence
 CRAWLING_MPS = 0.7
 CLIMBING_MPS = 0.15  # a slower climb is not worth a sentence
@@ -309,7 +310,7 @@ def is_opposed(f: Facts, name: str, side: int) -> bool:
             ahead_mps, left_mps, up_mps = f.velocity_mps
             target_leaves = abs(last_deg) - abs(first_deg) >= 2 * DRIFT_DEG and abs(last_deg) > LITTLE_DEG
             drone_turns_off = abs(now(f.yaw_rate_dps)) >= SLIGHT_DPS and not is_bearing_steady(f)
-            drone_falls_back = opens_m >= SLIDING_MPS and walk_mps > speed_mps + SLIDING_MPS
+            drone_falls_back = opens_m >= OPENING_M and walk_mps > speed_mps + SLIDING_MPS
             pace_changes = (hurries(f, 0) or slows(f, 0)) and word_of(f, "trend:distance") != "steady"
             flies_aside = max(-ahead_mps, abs(left_mps), abs(up_mps)) > max(SLIDING_MPS, ahead_mps)
             is_off_course = drone_turns_off or flies_aside or ahead_mps < DRIFTING_MPS or abs(last_deg) > FAR_DEG
@@ -319,9 +320,9 @@ def is_opposed(f: Facts, name: str, side: int) -> bool:
             is_across = side * last_deg < -1.0 and drift_deg < 0.0
             return drifts_away or is_across
         case "slow_down":
-            return walk_mps > max(0.0, speed_mps - SLIDING_MPS) or opens_m >= SLIDING_MPS or hurries(f, 0)
+            return walk_mps > max(0.0, speed_mps - SLIDING_MPS) or opens_m >= OPENING_M or hurries(f, 0)
         case "speed_up":
-            return walk_mps < speed_mps or opens_m <= -SLIDING_MPS
+            return walk_mps < speed_mps or opens_m <= -OPENING_M
         case "strafe":
             is_left_behind = side * last_deg < -LITTLE_DEG and drift_deg < -2 * DRIFT_DEG
             return opens_m >= 1.0 or is_left_behind
