@@ -21,7 +21,7 @@ from caption.stage.trial import show_windows
 from cosfly.formats.captions import read_captions
 from cosfly.llm import client
 from cosfly.llm.answers import Budget, BudgetConfig
-from cosfly.runtime.errors import ConfigError, TeacherError
+from cosfly.runtime.errors import ConfigError, StorageError, TeacherError
 from specimens import make_playback_tree
 
 
@@ -203,6 +203,20 @@ def test_a_run_that_is_ended_leaves_a_report_and_no_traceback(tree, tmp_path, wh
     assert report_of(out)["flights"]["kept"] == report_of(out)["flights"]["input"] == 2
     with deciding() as server:
         assert run(settings(server.url), tree, out).read_bytes() == whole
+
+
+def test_a_run_that_ends_early_counts_the_track_in_work_and_keeps_its_first_error(tree, tmp_path, monkeypatch):
+    def full(path: Path, captions: list) -> None:
+        raise StorageError("the file cannot be written", where=path)
+
+    monkeypatch.setattr(asking, "write_captions", full)
+    monkeypatch.setattr(asking, "WAITING_WINDOWS", 0)
+    with (
+        deciding(fault=lambda number, body: "401" if number >= 6 else None) as server,
+        pytest.raises(TeacherError, match="HTTP 401"),
+    ):
+        run(settings(server.url, endpoint={"concurrency": 2}), tree, tmp_path / "out")
+    assert report_of(tmp_path / "out")["flights"] == {"input": 1, "kept": 1, "dropped": {}, "failed": {}}
 
 
 def test_windows_with_recorded_answers_say_nothing_about_the_time_that_is_left():

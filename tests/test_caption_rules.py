@@ -9,6 +9,11 @@ from caption.schema import WindowConfig
 from caption.stage.windows import cut_windows
 from caption.teachers.rule_decisions import is_shaken, ranked
 from caption.teachers.rules import (
+    FAMILIES,
+    STRIKING_TOPICS,
+    TOPICS,
+    TOPICS_HIDDEN,
+    TOPICS_ORDERED,
     sentences,
     write_templates,
 )
@@ -43,6 +48,15 @@ def facts(tmp_path_factory):
             flight = replace(make_flight(seed=seed, variant=variant)[0], folder=folder)
             found += [measure_facts(window.observed) for window in cut_windows(flight, WindowConfig())]
     return found
+
+
+def test_each_decision_has_a_family_and_each_family_sentences():
+    assert sorted(token for family in FAMILIES.values() for token in family.tokens) == sorted(TOKENS)
+    assert len({english for english, _ in PAIRS}) >= 60
+    for name, family in FAMILIES.items():
+        assert sentences()["reasons"][name]
+        assert sentences()["consequences"][family.consequences]
+    assert {*TOPICS, *TOPICS_HIDDEN, *TOPICS_ORDERED, *STRIKING_TOPICS} == sentences()["facts"].keys()
 
 
 def test_both_languages_of_a_sentence_agree():

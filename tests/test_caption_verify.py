@@ -16,6 +16,7 @@ from caption.stage.windows import cut_windows
 from caption.verification.actions import TABLE, measure
 from caption.verification.facts import Facts, measure_facts
 from caption.verification.mirror import check_mirror
+from caption.verification.numerals import read_numerals
 from caption.verification.values import check_values
 from cosfly.formats.captions import ACTIONS, TOKENS, Coc, Language, verdict_on
 from cosfly.llm.answer_text import sentences_of
@@ -353,3 +354,15 @@ def test_what_is_implied_is_never_contradicted(drawn):
     if label is not None:
         assert label not in TABLE.contradicted_by(motion, None)
         assert TABLE.rules[label].shown(motion) >= 1.0
+
+
+def test_each_number_is_read_with_the_words_around_it():
+    english = "It is about 12.0 m away, more than 20 m high and less than 3 m/s fast; a box of 34 × 59 px."
+    chinese = "距离约12.0米，高度超过20米，速度每秒3米。"
+    for text, language, expected in [
+        (english, "en", [(12.0, "m", 0, True), (20.0, "m", 1, False), (3.0, "mps", -1, False), (34.0, "", 0, False),
+                         (59.0, "px", 0, False)]),
+        (chinese, "zh", [(12.0, "m", 0, True), (20.0, "m", 1, False), (3.0, "mps", 0, False)]),
+    ]:  # fmt: skip
+        numerals = read_numerals(text, language)
+        assert [(one.value, one.unit, one.bound, one.is_about) for one in numerals] == expected

@@ -13,7 +13,7 @@ from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxe
 from cosfly.formats.episodes import Episode, EpisodeFrame, episode_file, read_episode, write_episode
 from cosfly.formats.frames import PERSON_ID
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths, write_paths
-from cosfly.formats.people import GOAL_TERMS, Appearance, Goal, read_goal
+from cosfly.formats.people import GOAL_TERMS, Appearance, Goal, People, read_goal
 from cosfly.formats.roi import read_roi
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
 from cosfly.geometry.goals import SIDES, SLOTS, SeenFrame, find_says, meant, words_of
@@ -114,6 +114,18 @@ def test_path_and_trace_round_trip(tmp_path, write, read, make, group):
         change_json(path, lambda value, change=change, group=group: change(value[group][0]))
         with pytest.raises(InputError, match=rf"{group}\[0\].*{words}"):
             read(path)
+
+
+def test_the_most_alike_differs_least_the_greatest_id_of_several():
+    target = Appearance("man", "jacket", "red", "shorts", "blue")
+    one, two = (Appearance("man", "jacket", color, "shorts", color) for color in ("red", "green"))
+    people = People(
+        target, {9: two, 8: one, 7: one, 6: Appearance("woman", "coat", "pink", "trousers", "pink", "cap", "red")}
+    )
+    assert people.most_alike([9, 8, 7, 6]) == (8, 1)
+    assert people.most_alike([6, 9]) == (9, 2)
+    assert people.most_alike([6]) == (6, 4)
+    assert people.most_alike([]) == (None, None)
 
 
 def frame(time_s: float, answer: str, **more) -> EpisodeFrame:
