@@ -322,7 +322,8 @@ def test_a_name_that_no_record_can_hold(tmp_path):
 def test_records_of_others_are_not_ours(tmp_path):
     write_json(tmp_path / "manifest.json", {"name": "an app"})
     write_json(tmp_path / "map.json", [])
-    run_dir.checked_inputs({"map": tmp_path / "map.json"})
+    checked = run_dir.checked_inputs({"map": tmp_path / "map.json"})
+    assert checked["map"].sha256 == sha256_file(tmp_path / "map.json")
 
 
 def test_a_tree_of_others_with_a_manifest_of_theirs_is_known_by_its_flights(tmp_path):
