@@ -80,6 +80,11 @@ class DroneTrace:
     pace: str = PLAIN_PACE  # of the pedestrian trajectory
     part_of: Excerpt | None = None
 
+    @property
+    def is_flown(self) -> bool:
+        """Whether it is an episode of the closed loop, which may end before its pedestrian trajectory."""
+        return "ended" in self.solver
+
     def drawn_as(self, number: int) -> Excerpt:
         """Return the excerpt that determines its appearance as trajectory `number` of a run."""
         return self.part_of or Excerpt(self.path_id, number, self.targets_m[:1])

@@ -253,7 +253,7 @@ def bystanders_of(others: Path | None, traces: list[DroneTrace]) -> tuple[dict[s
         if trace.path_id not in bystanders:
             raise InputError("the file has no bystanders for the drone trajectory", where=where, fix=FROM_ONE_RUN)
         num_times = len(trace.time_s)
-        if "ended" in trace.solver:
+        if trace.is_flown:
             bystanders[trace.path_id] = [bystander.until(num_times) for bystander in bystanders[trace.path_id]]
         for bystander in bystanders[trace.path_id]:
             if len(bystander.positions_m) != num_times:
