@@ -15,6 +15,7 @@ from processes import QUICK, children_of, is_running, wait_until
 from toy_workers import items_of, make_faulty, stage_in
 
 import cosfly
+from cosfly.runtime import console
 from cosfly.runtime.errors import EnvironmentMissing, InputError, StorageError
 from cosfly.runtime.events import LOSSES, read_events
 from cosfly.runtime.json_io import dump_json
@@ -163,6 +164,14 @@ def test_an_item_that_never_ends_has_failed_and_the_others_are_done(tmp_path, ca
     assert "finished no step within its time limit" in failure.message
     assert caplog.text.count("cosfly tries the item again") >= 2
     assert not list((tmp_path / "s").glob(".*.partial"))
+
+
+def test_work_that_stands_still_shows_a_sign_of_life(monkeypatch, caplog):
+    monkeypatch.setattr(console, "SECONDS_BETWEEN_LINES", 0.001)
+    monkeypatch.setattr(console, "SECONDS_OF_SILENCE", 0.001)
+    with caplog.at_level("INFO"), console.progress_bar("demo", 2) as advance:
+        advance(1, "the second item")
+        wait_until(lambda: caplog.text.count("demo: 1 of 2, the second item, for ") >= 2)
 
 
 def test_workers_that_die_all_the_time_end_the_stage(tmp_path):

@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -28,7 +29,9 @@ console = _Console(stderr=True)
 answer_console = _Console(stderr=False)  # for the result of a command
 log = logging.getLogger(__name__)
 
-SECONDS_BETWEEN_LINES = 10.0  # progress as log lines where there is no terminal
+# Progress as log lines where there is no terminal.
+SECONDS_BETWEEN_LINES = 10.0
+SECONDS_OF_SILENCE = 30.0  # until a line says that nothing has changed; each next one after twice the time
 
 
 class _Lines(logging.Handler):
@@ -61,7 +64,7 @@ Advance = Callable[..., None]  # advance(count, words=""): moves a bar and sets 
 
 @contextlib.contextmanager
 def progress_bar(label: str, total: int | None, done: int = 0) -> Iterator[Advance]:
-    """Yield a function that shows progress: as a bar on a terminal, else as a log line every few seconds."""
+    """Yield a function that shows progress: as a bar on a terminal, else as log lines, also while nothing changes."""
     if console.is_terminal:
         name = TextColumn("{task.description}", markup=False)
         columns = (name, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
@@ -73,18 +76,34 @@ def progress_bar(label: str, total: int | None, done: int = 0) -> Iterator[Advan
 
             yield move
         return
-    position = done
-    last_s = time.monotonic()
+    state = (done, "")
 
     def advance(count: int, words: str = "") -> None:
-        nonlocal position, last_s
-        position += count
-        if time.monotonic() - last_s >= SECONDS_BETWEEN_LINES:
-            last_s = time.monotonic()
-            of_all = "" if total is None else f" of {total}"
-            log.info("%s: %d%s%s", label, position, of_all, f", {words}" if words else "")
+        nonlocal state
+        state = (state[0] + count, words)
 
-    yield advance
+    def write_lines() -> None:
+        shown, changed_s, next_line_s = state, time.monotonic(), SECONDS_OF_SILENCE
+        while not ended.wait(SECONDS_BETWEEN_LINES):
+            unchanged_s = time.monotonic() - changed_s
+            if state != shown:
+                shown, changed_s, next_line_s = state, time.monotonic(), SECONDS_OF_SILENCE
+                since = ""
+            elif unchanged_s >= next_line_s:
+                next_line_s *= 2
+                since = f", for {duration(unchanged_s)} so far"
+            else:
+                continue
+            position, words = shown
+            of_all = "" if total is None else f" of {total}"
+            log.info("%s: %d%s%s%s", label, position, of_all, f", {words}" if words else "", since)
+
+    ended = threading.Event()
+    threading.Thread(target=write_lines, daemon=True).start()
+    try:
+        yield advance
+    finally:
+        ended.set()
 
 
 def duration(seconds: float) -> str:
