@@ -205,7 +205,7 @@ class _Examination:
             return True
         tokens = trial.prompt_tokens - without
         if tokens < len(pictures):
-            fix = self.client.fix_of(MEANINGS["pictures"])
+            fix = self.client.fix_of(MEANINGS["text_only"])
             self._add("image input", "unusable", f"{count} are accepted but ignored: they add {tokens} tokens; {fix}")
             return False
         self._add("image input", "ok", f"{count}, {tokens} tokens")
@@ -218,6 +218,10 @@ class _Examination:
         trial = await self._ask("the largest prompt", self.largest, endpoint.max_tokens, schema)
         if trial.reply is not None:
             await self._check_context(trial.prompt_tokens)
+            if trial.reply.finish_reason == "length":
+                limit = f"caption.endpoint.max_tokens={endpoint.max_tokens}"
+                fix = "a good answer takes about 200 tokens: raise the limit, or use a model that ends its answers"
+                self._add("answer length", "warning", f"the answer is cut at {limit}; {fix}")
             self._report_speed(trial.seconds)
         elif trial.seconds >= endpoint.timeout_s:
             await self._report_too_slow()

@@ -21,7 +21,9 @@ from cosfly.runtime.config import read_yaml
 from cosfly.runtime.escaping import without_keys
 from cosfly.runtime.model_json import DECLINED
 
-Kind = Literal["account", "too_long", "pictures", "no_system", "schema", "parameter", "content", "unknown"]
+Kind = Literal[
+    "account", "too_long", "text_only", "pictures", "no_system", "schema", "parameter", "content", "unknown"
+]  # fmt: skip
 
 KEY_VARIABLE = "COSFLY_API_KEY"
 MOST_CHARACTERS = 4000  # of a text that are searched: some servers echo the request
