@@ -255,7 +255,7 @@ class Asking:
             return
         self.dropped[str(caption.drop_reason)] += 1
         if self.dropped.total() == limit:
-            what = f"none of the first {limit} answers was accepted"
+            what = f"none of the first {limit} windows was accepted"
             see = f"to see why, read {self.stage.path / ANSWERS}/*.jsonl or run `cosfly caption doctor`"
             fix = f"{see}; to continue anyway, pass --set caption.stop_after_dropped=0"
             raise TeacherError(what, where=self.cfg.teacher, got=explain_drops(self.dropped), fix=fix)

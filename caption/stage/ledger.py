@@ -27,7 +27,7 @@ REASONS = {
     "refused": "the server or engine refused the request; see `checks.refusal`",
     "declined": "the model declined to answer; see `checks.refusal`",
     "not_in_file": "the file of captions or predictions has none for this window",
-    "structure": "no answer had the requested fields; see `checks.structure`",
+    "structure": "the last answer did not have the requested fields; see `checks.structure`",
     "context_full": "prompt and answer fill the server's context: raise it, or send smaller pictures",
     "conflict": "the decision is in conflict with the trajectory (see `verdict`), and it is not asked again",
     "no_label": "the decision is in conflict, and geometry has no label to anchor a regeneration to",
@@ -48,7 +48,7 @@ def most_common(counts: Mapping[str, int]) -> dict[str, int]:
 def explain_drops(dropped: Mapping[str, int]) -> str:
     """Return the three most common reasons with their counts and meanings."""
     reasons = list(most_common(dropped).items())[:3]
-    return "; ".join(f"{count} {reason} ({REASONS[reason]})" for reason, count in reasons)
+    return "; ".join(f"{count} dropped because of {reason}: {REASONS[reason]}" for reason, count in reasons)
 
 
 # --- the report -------------------------------------------------------------------------------------------------------

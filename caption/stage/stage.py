@@ -137,7 +137,7 @@ def _finish(
         raise stage.nothing_kept(outcome.tracks, expected=f"a track of at least {num_frames} frames")
     if not tally.kept:
         causes = explain_drops(tally.dropped + tally.failed)
-        fix = f"fix the causes ({causes}), or change the settings and choose another --out"
+        fix = f"{causes}; use another model or other settings, and another --out"
         raise stage.nothing_kept(tally, where=out / PRODUCT, fix=fix)
     outputs = [out / PRODUCT, out / REPORT, out / PAGE, *sorted((out / ANSWERS).glob("*.jsonl"))]
     outputs += keep_own_prompts(out, vocabulary)

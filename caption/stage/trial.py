@@ -6,6 +6,7 @@ again.
 
 import asyncio
 import logging
+import time
 from collections import Counter
 from collections.abc import Iterator
 from itertools import islice
@@ -16,13 +17,14 @@ from caption.stage.asking import ANSWERS
 from caption.stage.ledger import REASONS
 from caption.stage.stage import open_stage
 from caption.stage.tracks import find_inputs
-from caption.stage.window_loop import caption_window
+from caption.stage.window_loop import MOST_ASKS, caption_window
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.students import student_settings
 from caption.teachers.teacher import EMBEDDED, AskingTeacher, open_teacher
 from cosfly.formats.captions import FIELDS, Caption
 from cosfly.llm.answers import AnswerBook, Budget
 from cosfly.llm.contract import NoAnswer, Reply, Request, run_until_interrupted
+from cosfly.runtime.console import Advance, duration, progress_bar
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError, TeacherError
 from cosfly.runtime.escaping import LONGEST_LOG, for_terminal
 from cosfly.runtime.model_json import find_object
@@ -31,6 +33,7 @@ log = logging.getLogger(__name__)
 
 # Reasons why an answer has no JSON object, in words.
 STRUCTURES = {"no_json_object": "no JSON object", "cut_short": "cut at caption.endpoint.max_tokens"}
+WAITING = "waiting for the next one"
 MOST_LOGGED = 200  # characters of an answer that are logged when it arrives
 
 
@@ -53,13 +56,15 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
     num_of_track = Counter(unfinished[number * len(unfinished) // num_windows] for number in range(num_windows))
     windows = [window for track, count in num_of_track.items() for window in islice(track.windows(cfg), count)]
     exchanges: dict[str, list[tuple[Request, Reply]]] = {window.observed.sample_id: [] for window in windows}
+    start_s = time.monotonic()
 
-    def record(sample_id: str, request: Request, reply: Reply) -> None:
-        exchanges[sample_id].append((request, reply))
-        number, problem = len(exchanges[sample_id]), _problem_of(reply)
-        log.info("%s: answer %d%s: %s", sample_id, number, problem, for_terminal(reply.text, MOST_LOGGED))
+    async def ask(advance: Advance) -> list[Caption | BaseException]:
+        def record(sample_id: str, request: Request, reply: Reply) -> None:
+            exchanges[sample_id].append((request, reply))
+            number, problem = len(exchanges[sample_id]), _problem_of(reply)
+            log.info("%s: answer %d%s: %s", sample_id, number, problem, for_terminal(reply.text, MOST_LOGGED))
+            advance(1, WAITING)
 
-    async def ask() -> list[Caption | BaseException]:
         with AnswerBook(out / ANSWERS) as book:
             budget = Budget(cfg.budget, cfg.most_in_flight, book.totals)
             async with open_teacher(cfg, book, seed, budget) as teacher:
@@ -68,7 +73,11 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
                 asked = [caption_window(window, teacher, cfg, vocabulary) for window in windows]
                 return await asyncio.gather(*asked, return_exceptions=True)
 
-    outcomes = run_until_interrupted(ask())
+    log.info("a window takes 2 answers, up to %d if some are refused, and more if a decision is in conflict", MOST_ASKS)
+    with progress_bar("answers", None) as advance:
+        advance(0, WAITING)
+        outcomes = run_until_interrupted(ask(advance))
+    seconds = time.monotonic() - start_s
     for outcome in outcomes:
         if not isinstance(outcome, Caption | NoAnswer | CosflyError):
             raise outcome
@@ -92,6 +101,9 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
                 yield "fix: remove caption.endpoint.json_schema=false, so that the server enforces the fields"
         else:
             yield f"no answer: {for_terminal(str(outcome))}"
+    num_accepted = sum(isinstance(outcome, Caption) and outcome.status == "accepted" for outcome in outcomes)
+    num_answers = sum(map(len, exchanges.values()))
+    yield f"=== {num_accepted} of {len(windows)} windows accepted, {num_answers} answers in {duration(seconds)} ==="
 
 
 def _outcome_lines(caption: Caption) -> Iterator[str]:
@@ -100,6 +112,7 @@ def _outcome_lines(caption: Caption) -> Iterator[str]:
     yield caption.status if reason is None else f"dropped because of {reason}: {REASONS[reason]}"
     facts = [("label", caption.label), ("verdict", caption.verdict)]
     facts += [("structure", checks.structure), ("refusal", checks.refusal)]
+    facts += [("answer refused", reason) for reason in checks.refused or ()]
     facts += [("contradicted", text) for text in checks.contradictions or ()]
     for language, answer in (("en", caption.en), ("zh", caption.zh)):
         if answer is not None:

@@ -26,6 +26,7 @@ from cosfly.runtime.model_json import CONTEXT_FULL, DECLINED
 STRUCTURE_ASKS = 3  # until an answer has the right structure
 CORRECTION_ASKS = 1  # that name what was wrong with an answer of the right structure
 MIRROR_ASKS = 2  # for the Chinese mirror, until the pair is consistent
+MOST_ASKS = STRUCTURE_ASKS * (1 + CORRECTION_ASKS) + MIRROR_ASKS  # of a window without a conflict
 MAX_COMPLAINTS = 8  # named at once
 MOST_REFUSAL_TEXT = 300  # characters of a refusal in the record
 CONTRADICTED = "contradicted_value"
