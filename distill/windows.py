@@ -161,7 +161,7 @@ class WindowDataset(Sequence[WindowData]):
             sample_id=place.sample_id, flight="/".join(place.flight), window=np.array(place.window, dtype=np.int64),
             frames=np.ascontiguousarray(np.stack(frames).transpose(0, 3, 1, 2)),
             facts={name: _column(rows, name) for name in FACTS},
-            prompt=Prompt(system=system, user=user).told(sentence).model_dump(),
+            prompt=Prompt(system=system, user=user).filled(sentence).model_dump(),
             caption=caption | {name: last[name] or "" for name in ("label", "verdict")},
         )  # fmt: skip
 

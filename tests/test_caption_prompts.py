@@ -236,7 +236,7 @@ def test_a_prompt_tells_the_goal_and_the_others_in_both_languages(flight):
     numbers = [re.findall(r"\d+(?:\.\d+)?", text.rpartition("\n")[2]) for text in prompts.values()]
     assert numbers == [["0", "1", "2", "3", "3", "4.0", "3.5", "2.3", "2.5", "2", "1", "1", "1"]] * 2
     for text in prompts.values():  # pictures alone: the goal stays
-        assert Prompt(system="", user=text).told("P", measured=False).user.count("\n") == 1
+        assert Prompt(system="", user=text).filled("P", measured=False).user.count("\n") == 1
 
 
 def test_what_is_said_of_others_is_judged_by_the_geometry(flight):

@@ -166,7 +166,7 @@ def test_an_item_that_never_ends_has_failed_and_the_others_are_done(tmp_path, ca
     assert not list((tmp_path / "s").glob(".*.partial"))
 
 
-def test_work_that_stands_still_shows_a_sign_of_life(monkeypatch, caplog):
+def test_work_without_progress_logs_a_heartbeat(monkeypatch, caplog):
     monkeypatch.setattr(console, "SECONDS_BETWEEN_LINES", 0.001)
     monkeypatch.setattr(console, "SECONDS_OF_SILENCE", 0.001)
     with caplog.at_level("INFO"), console.progress_bar("demo", 2) as advance:

@@ -337,7 +337,7 @@ def test_windows_are_those_of_the_tree(place, language):
         pictures = np.stack([read_view(folder / frame_name(index), "rgb") for index in caption.window])
         assert np.array_equal(window["frames"], pictures.transpose(0, 3, 1, 2))
         sentence = Pictures(("rgb",), caption.picture_px).sentence(language)
-        assert window["prompt"] == caption.prompt[language].told(sentence).model_dump()
+        assert window["prompt"] == caption.prompt[language].filled(sentence).model_dump()
         texts = (caption.en if language == "en" else caption.zh).model_dump()
         assert window["caption"] == texts | {"label": caption.label or "", "verdict": caption.verdict or ""}
         facts = facts_in_tree(read_track(folder), list(caption.window))

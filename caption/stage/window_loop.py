@@ -230,7 +230,7 @@ class WindowLoop:
         the judge would put in place of the decision replaces it only if the text does not state another decision.
         """
         english = self.english.coc
-        flight_data = question.prompts["en"].told(replace(question.pictures, views=()).sentence("en")).user
+        flight_data = question.prompts["en"].filled(replace(question.pictures, views=()).sentence("en")).user
         conflict = Conflict(sample_id=self.caption.sample_id, flight_data=flight_data, answer=english, label=self.label)
         self.caption.judge = judgement = await judge.judge(conflict)
         if judgement.verdict == "ACCEPT_ALTERNATIVE":

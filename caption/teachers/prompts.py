@@ -59,7 +59,7 @@ class Question:
 
     @property
     def asked(self) -> dict[Language, Prompt]:
-        return {language: prompt.told(self.pictures.sentence(language)) for language, prompt in self.prompts.items()}
+        return {language: prompt.filled(self.pictures.sentence(language)) for language, prompt in self.prompts.items()}
 
 
 @lru_cache

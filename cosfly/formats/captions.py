@@ -131,7 +131,7 @@ class Prompt(Record):
     system: str
     user: str
 
-    def told(self, pictures: str, *, measured: bool = True) -> Prompt:
+    def filled(self, sentence: str, *, measured: bool = True) -> Prompt:
         """Return the question with a sentence about the pictures, with or without measurements; the goal is kept."""
         user = self.user
         begin, mark, end = user.partition(PICTURES_MARK)
@@ -139,7 +139,7 @@ class Prompt(Record):
             first, *lines = end.split("\n")
             goals = [line for line in lines if line.startswith(GOAL_BEGINS)]
             user = begin + mark + "\n".join([first, *goals])
-        return Prompt(system=self.system, user=user.replace(PICTURES_MARK, pictures))
+        return Prompt(system=self.system, user=user.replace(PICTURES_MARK, sentence))
 
 
 _Value = TypeVar("_Value")

@@ -167,7 +167,7 @@ def make_sample(
         sample_id=sample_id or caption.sample_id, language=language, run=run, window_id=caption.sample_id, walk="",
         window=tuple(caption.window), views=pictures.views, picture_px=pictures.size_px,
         depth_range_m=pictures.depth_range_m,
-        prompt=caption.prompt[language].told(pictures.sentence(language), measured=cfg.text_state), answer=answer,
+        prompt=caption.prompt[language].filled(pictures.sentence(language), measured=cfg.text_state), answer=answer,
         decision=parsed.coc.flight_decision, label=None if is_noisy else caption.label,
         contradicted=None if is_noisy or ruled_out is None else tuple(ruled_out),
     )  # fmt: skip

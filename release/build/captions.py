@@ -84,21 +84,21 @@ class CaptionAccount:
 
 
 def index_captions(
-    path: Path, released: Mapping[FlightKey, TrackCaptions], not_released: set[FlightKey], account: CaptionAccount
+    path: Path, released: Mapping[FlightKey, TrackCaptions], unreleased: set[FlightKey], account: CaptionAccount
 ) -> None:
     """Read the captions of a tree once; add those of released tracks to these, and all to the account. InputError if a
     caption is of no track of the tree, lacks a language, or repeats a frame."""
     for span, caption in caption_spans(path):
         key = (caption.town, caption.trajectory, caption.variant)
         try:
-            _check(caption, is_known=key in released or key in not_released)
+            _check(caption, is_known=key in released or key in unreleased)
             if key in released:
                 released[key].add(caption, span)
         except InputError as error:
             error.where = f"{path}: {caption.sample_id}"
             raise
         account.add(caption)  # after its checks
-        if key in not_released and caption.status == "accepted":
+        if key in unreleased and caption.status == "accepted":
             account.of_other_tracks += 1
 
 

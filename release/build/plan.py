@@ -179,8 +179,8 @@ def _index_captions(sources: list[Source], material: Material, tracks: list[Chos
                 what, fix = "the track occurs in several runs below this directory", "build a release of each run"
                 raise InputError(what, where=source.captions, got="/".join(key), fix=fix)
             released[key] = track.captions
-        not_released = {one.key for one in material.candidates if one.source == number} - released.keys()
-        index_captions(source.captions, released, not_released, total)
+        unreleased = {one.key for one in material.candidates if one.source == number} - released.keys()
+        index_captions(source.captions, released, unreleased, total)
     return total
 
 

@@ -118,7 +118,7 @@ def _samples_of(
         sentence = frame_views.Pictures(("rgb",), size_px).sentence(language)
         if is_last:
             sentence = LAST_FRAME_SENTENCE[language].format(*size_px)
-        prompt, reply = Prompt(system=system, user=user).told(sentence), dump_json(answer)
+        prompt, reply = Prompt(system=system, user=user).filled(sentence), dump_json(answer)
         if any(mark in text for mark in MARKS for text in (prompt.system, prompt.user, reply)):
             skipped["a text with a mark for pictures"] += 1  # a loader would look for one more
             continue
