@@ -24,7 +24,7 @@ from cosfly.runtime.io import sha256_bytes, write_bytes
 from cosfly.runtime.json_io import FileFormat, validated, write_json, write_model
 from cosfly.runtime.model_json import find_object
 from cosfly.runtime.run_dir import StageFolder, Tally, hold_folder
-from cosfly.viz.topview import HALO, TopView, draw_map, draw_text, png_bytes
+from cosfly.viz.topview import TopView, draw_labels, draw_map, png_bytes
 from cosfly.worldgen.plan import OBJECTS, PLAN_FORMAT, WorldPlan, assets
 from cosfly.worldgen.rules import plan_by_rules
 from cosfly.worldgen.town import CM_PER_M, Town, build, layout_nodes, of_kinds, placement_nodes, trees_of
@@ -216,8 +216,7 @@ def _picture(town: Town, plan: WorldPlan) -> bytes:
     for name, block in zip(block_names, town.open_blocks, strict=False):
         if not any(block.covers(shapely.Point(obj.xy)) for obj in objects):
             labels.append((name, block.centroid.coords[0]))
-    for name, xy in labels:
-        draw_text(picture, name, *view.pixels(np.array([xy]))[0], align=0.5, halo=HALO)
+    draw_labels(picture, [(name, view.pixels(np.array([xy]))[0]) for name, xy in labels])
     return png_bytes(picture)
 
 
