@@ -123,7 +123,7 @@ def draw_labels(picture: np.ndarray, labels: Sequence[tuple[str, np.ndarray]]) -
         free = ((middle, box) for middle, box in middles if frame.contains(box) and not box.intersects(others))
         middle, box = next(free, (place, taken[k]))
         taken.append(box)
-        texts.append((name, *(middle + [0, height / 2])))
+        texts.append((name, middle[0], middle[1] + height / 2))
         if line := list(shapely.LineString([place, middle]).difference(box).coords):
             draw_line(picture, np.array(line), INK, halo=3)
             draw_dot(picture, place, 3, INK)
