@@ -264,15 +264,17 @@ def finish_episodes(
         flown = [trace_of(read_episode(path), obstacles) for path in files]
         write_traces(stage.path / TRACES, flown, {"student": fly.student, "seed": seed})
         outputs.append(stage.path / TRACES)
-    score = score_episodes(map(read_episode, files), seed=seed)
+    score = score_episodes(map(read_episode, files), seed=seed, most_decisions=fly.most_decisions)
     write_model(stage.path / SCORE, score, SCORE_FORMAT)
     ended = Counter[str](episode.ended for episode in score.flights)
     decisions = sum(sum(episode.answers.values()) for episode in score.flights)
     stage.finish(outputs, tally, flown=dict(sorted(ended.items())) | {"decisions": decisions})
     log.info(
-        "fly: %s: target in the picture in %.1f %%, visible in %.1f %% of the frames; %s; %d decisions",
+        "fly: %s: target in the picture in %.1f %%, visible in %.1f %% of the frames; %s; %d decisions%s; see %s",
         fly.student, *(100 * (score.figures[name].value or 0.0) for name in ("in_picture", "in_view")),
         ", ".join(f"{count} {end}" for end, count in sorted(ended.items())), decisions,
+        f" (episodes shortened by fly.most_decisions={fly.most_decisions})" if fly.most_decisions else "",
+        stage.path / SCORE,
     )  # fmt: skip
 
 
