@@ -155,16 +155,17 @@ def run(
         plans = planning.run(cfg.plan, simplified, paths, out / PLAN, **common)
         num_workers = 1 if cfg.fly.asks_model else workers
         traces = read_traces(plans)
-        reasons = [_drop_reason(trace, cfg.fly) for trace in traces]
+        num_lead = cfg.fly.lead_frames
+        reasons = [trace.drop_reason or ("too_short" if len(trace.time_s) <= num_lead else None) for trace in traces]
         flown = [n for n, reason in enumerate(reasons) if reason is None]
         dropped = Counter(reason for reason in reasons if reason is not None)
         if not flown:
-            expected = f"at least one accepted trajectory of more than {cfg.fly.lead_frames} frames (fly.lead_frames)"
+            expected = f"at least one accepted trajectory of more than {num_lead} frames (fly.lead_frames)"
             raise stage.nothing_kept(Tally(input=len(traces), dropped=dropped), expected=expected)
         # Neighbours in one batch share the lit area of the renderer.
         ordered = sorted(flown, key=lambda n: (Airspace.area_of(traces[n].targets_m), n))
         num_frames = {n: len(_cut(traces[n], cfg.fly).time_s) for n in flown}
-        episodes = [ListedEpisode(traces[n].path_id, n, num_frames[n] - cfg.fly.lead_frames) for n in ordered]
+        episodes = [ListedEpisode(traces[n].path_id, n, num_frames[n] - num_lead) for n in ordered]
         batch = min(cfg.fly.batch, math.ceil(len(flown) / num_workers))
         start = partial(open_map, cfg, seed, boxes, simplified, plans, others)
         fly_episodes(stage, cfg, [episodes], batch, start, seed, num_workers, watch)
@@ -297,13 +298,6 @@ def open_map(
         )
 
     return open_episode
-
-
-def _drop_reason(trace: DroneTrace, cfg: FlyConfig) -> str | None:
-    """Return why a plan is not flown; None if it is."""
-    if trace.drop_reason:
-        return trace.drop_reason
-    return "too_short" if len(trace.time_s) <= cfg.lead_frames else None
 
 
 def _cut(trace: DroneTrace, cfg: FlyConfig) -> DroneTrace:

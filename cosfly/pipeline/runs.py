@@ -227,14 +227,10 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
 
 
 def caveats(cfg: RunConfig) -> list[str]:
-    """Return remarks on settings that apply to some trajectories only, and on targets too small to see."""
-    return [*cfg.plan.remarks(), *small_targets(cfg)]
+    """Return remarks on settings that apply to some trajectories only, and on targets too small to see.
 
-
-def small_targets(cfg: RunConfig) -> list[str]:
-    """Return a remark if the target is lower than LEGIBLE_HEIGHT_PX in the styles of SMALL_SHARE of the time or more.
-
-    Distances, altitudes and fields of view are the middles of their ranges.
+    Too small: lower than LEGIBLE_HEIGHT_PX in the styles of SMALL_SHARE of the time or more. Distances, altitudes and
+    fields of view are the middles of their ranges.
     """
     plan, render = cfg.plan, cfg.render
     fov_deg = sum(render.fovs_deg) / len(render.fovs_deg)
@@ -250,11 +246,12 @@ def small_targets(cfg: RunConfig) -> list[str]:
         if share > 0 and height_px < LEGIBLE_HEIGHT_PX:
             small[f"{name} {height_px:.0f} px"] = share
     if sum(small.values()) < SMALL_SHARE * sum(plan.styles.values()):
-        return []
+        return cfg.plan.remarks()
     return [
+        *cfg.plan.remarks(),
         f"the target is lower than {LEGIBLE_HEIGHT_PX:g} px in pictures ({', '.join(small)}), so it can hardly be "
         "recognized. Choose larger pictures (render.width_px), a narrower field of view (render.fovs_deg), or smaller "
-        "distances (plan.behind_distance_m, plan.altitude_preferred_m, plan.style_ranges)"
+        "distances (plan.behind_distance_m, plan.altitude_preferred_m, plan.style_ranges)",
     ]
 
 
