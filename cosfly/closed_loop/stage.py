@@ -203,7 +203,8 @@ def fly_episodes(
             num_steps = sum(episode.num_steps for episode in episodes)
             items.append(Item(f"{episodes[0].name} and {len(episodes) - 1}", payload, num_steps))
     worker_args = (cfg, start, stage.path, seed, num_workers, list_sha256)
-    run_items(stage, items, make_worker, worker_args, workers=num_workers, watch=watch_of(cfg.fly, watch))
+    watch = watch_of(cfg.fly, watch)
+    run_items(stage, items, make_worker, worker_args, workers=num_workers, watch=watch, label="fly: decisions")
 
 
 def make_worker(
