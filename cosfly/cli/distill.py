@@ -172,8 +172,6 @@ def leaderboard(
     out: options.Out,
 ) -> None:
     """Compare students: figures with intervals, floors and a ceiling."""
-    named_folders = []
-    for text in folders:
-        name, separator, folder = text.partition("=")
-        named_folders.append((name, Path(folder)) if separator else ("", Path(text)))
-    job.run("cosfly.closed_loop.leaderboard", named_folders, out)
+    parts = (text.partition("=") for text in folders)
+    named = [(name, Path(folder)) if equals else ("", Path(name)) for name, equals, folder in parts]
+    job.run("cosfly.closed_loop.leaderboard", named, out)

@@ -217,8 +217,8 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
     lines = [
         f"estimates are based on {BASIS}",
         f"total: about {time}; {in_words(needed)} of disk space ({in_words(free)} are free)",
+        *caveats(cfg),
     ]
-    lines += caveats(cfg)
     if unknown:
         lines.append("run cosfly caption --limit 10: its report has the tokens and cost of a caption")
     if needed > free:

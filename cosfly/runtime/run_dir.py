@@ -52,8 +52,7 @@ from cosfly.runtime.json_io import (
 
 log = logging.getLogger(__name__)
 
-# What a stage counts, for its last line.
-ITEMS = {
+ITEMS = {  # what a stage counts
     "maps": "objects", "simplify": "maps", "pedestrians": "trajectories", "plan": "trajectories", "render": "tracks",
     "inspect": "tracks", "caption": "windows", "release": "tracks", "fly": "episodes", "leaderboard": "students",
     "world": "towns and objects",

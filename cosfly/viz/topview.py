@@ -114,7 +114,6 @@ def draw_labels(picture: np.ndarray, labels: Sequence[tuple[str, np.ndarray]]) -
     frame = shapely.box(0, 0, picture.shape[1], picture.shape[0])
     taken: list[shapely.Geometry] = [shapely.Point(place).buffer(6) for _, place in labels]
     offsets = [r * np.array([np.cos(a), np.sin(a)]) for r in range(0, 400, 8) for a in np.linspace(-np.pi, np.pi, 17)]
-    texts = []
     for k, (name, place) in enumerate(labels):
         (width, height), _ = cv2.getTextSize(name, FONT, 0.55, 1)
         others = shapely.union_all(taken[:k] + taken[k + 1 :])
@@ -123,12 +122,11 @@ def draw_labels(picture: np.ndarray, labels: Sequence[tuple[str, np.ndarray]]) -
         free = ((middle, box) for middle, box in middles if frame.contains(box) and not box.intersects(others))
         middle, box = next(free, (place, taken[k]))
         taken.append(box)
-        texts.append((name, middle[0], middle[1] + height / 2))
         if line := list(shapely.LineString([place, middle]).difference(box).coords):
             draw_line(picture, np.array(line), INK, halo=3)
             draw_dot(picture, place, 3, INK)
-    for name, x, y in texts:
-        draw_text(picture, name, x, y, align=0.5, halo=HALO)
+    for (name, _), box in zip(labels, taken[len(labels) :], strict=True):
+        draw_text(picture, name, box.centroid.x, box.bounds[3] - 4, align=0.5, halo=HALO)
 
 
 def add_caption(picture: np.ndarray, text: str) -> np.ndarray:

@@ -215,8 +215,9 @@ def _picture(town: Town, plan: WorldPlan) -> bytes:
     picture = draw_map(town.boxes, view)
     block_names = ["plaza"] * plan.plazas + ["green"] * plan.greens  # in the order of the open blocks
     labels = [(obj.name, obj.xy) for obj in town.placed if obj.number == 0 and OBJECTS[obj.name].where != "layout"]
-    blocks = zip(block_names, town.open_blocks, strict=False)
-    labels += [(name, block.centroid.coords[0]) for name, block in blocks]
+    for name, block in zip(block_names, town.open_blocks, strict=False):
+        if not any(block.covers(shapely.Point(xy)) for _, xy in labels):
+            labels.append((name, block.centroid.coords[0]))
     draw_labels(picture, [(name, view.pixels(np.array([xy]))[0]) for name, xy in labels])
     return png_bytes(picture)
 
