@@ -226,12 +226,12 @@ def test_a_score_adds_up_and_is_read_as_written(tmp_path):
 GOOD, BAD = "1111111111", "1111100000"
 
 
-def folder(root, name, seen, *, student=None, **columns):
+def folder(root, name, seen, *, student=None, most_decisions=0, **columns):
     flights = [flight(one, walk=f"path_{k}", **columns) for k, one in enumerate(seen)]
     flights = [one.model_copy(update={"student": student or name}) for one in flights]
     for one in flights:
         write_episode(episode_file(root / name, one.episode), one)
-    write_model(root / name / SCORE, score_episodes(flights), SCORE_FORMAT)
+    write_model(root / name / SCORE, score_episodes(flights, most_decisions=most_decisions), SCORE_FORMAT)
     return root / name
 
 
@@ -253,9 +253,10 @@ def test_the_best_is_first_and_foreign_words_are_escaped(tmp_path):
 def test_other_episodes_are_another_table_and_two_students_of_one_name_are_refused(tmp_path):
     one = folder(tmp_path, "one", [GOOD, BAD], student="s")
     other = folder(tmp_path, "other", [GOOD, BAD, GOOD], student="s")
-    third = folder(tmp_path, "third", [GOOD, BAD, GOOD])
+    third = folder(tmp_path, "third", [GOOD, BAD, GOOD], most_decisions=10)
     tables, page = board(tmp_path / "a", f"x={one}", f"y={other}", third)
     assert [len(table["standings"]) for table in tables] == [1, 2]
     assert "different lists of episodes" in page
+    assert page.count("shortened: at most 10 decisions") == 2  # in both tables of this student alone
     done = invoke(f"leaderboard {other} s={third} --out {tmp_path / 'b'}")
     assert "NAME=DIR" in str(done.exception)

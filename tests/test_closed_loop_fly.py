@@ -138,15 +138,13 @@ def test_a_policy_of_ones_own_flies_as_a_student_that_decides_the_same(town, tmp
     code = "class Ahead:\n    def reset(self, goal, seed): pass\n    def act(self, seen): return 'track_straight'\n"
     (tmp_path / "ahead_policy.py").write_text(code)
     monkeypatch.chdir(tmp_path)
-    flown = fly(town, tmp_path / "policy", f"{SHORT} --policy ahead_policy:Ahead")
+    flown = fly(town, tmp_path / "policy", f"{SHORT} --student policy:ahead_policy:Ahead")
     same = fly(town, tmp_path / "floor", f"{SHORT} --student track_straight")
     for one, other in zip(flown.values(), same.values(), strict=True):
         assert (one.engine, one.student) == ("policy", "ahead_policy:Ahead")
         assert [f.command for f in one.frames] == [f.command for f in other.frames]
-    assert "--policy" in attempt(town, tmp_path / "both", f"{SHORT} --policy ahead_policy:Ahead --student rules").output
-    assert "ahead_policy:Missing" in str(
-        attempt(town, tmp_path / "none", f"{SHORT} --policy ahead_policy:Missing").exception
-    )
+    wrong = attempt(town, tmp_path / "none", f"{SHORT} --student policy:ahead_policy:Missing")
+    assert "ahead_policy:Missing" in str(wrong.exception)
 
 
 ONE = "--set caption.endpoint.max_tries=1 --set fly.side_by_side=3"

@@ -333,7 +333,7 @@ def test_a_whole_list_gives_records_and_a_score(tmp_path, in_this_process, monke
     (tmp_path / "own.py").write_text(POLICIES)
     monkeypatch.chdir(tmp_path)
     out = tmp_path / "out"
-    invoke("fly", "--env", FOLLOW, "--policy", "own:Word", "--out", out, "--workers", "1")
+    invoke("fly", "--env", FOLLOW, "--student", "policy:own:Word", "--out", out, "--workers", "1")
     records = [read_episode(path) for path in sorted((out / "episodes").glob("*.json"))]
     assert len(records) == 20
     assert {frame.answer for one in records for frame in one.decisions} == {"invalid"}

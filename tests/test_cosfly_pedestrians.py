@@ -68,18 +68,20 @@ def test_people_walk_where_the_settings_say(ground, columns):
     assert not found.parts[:, columns:].any()
 
 
-def test_walkable_ground_in_small_areas_is_left_out_and_counted(caplog):
+def test_walkable_ground_in_small_areas_is_left_out_and_counted(tmp_path, caplog):
     caplog.set_level("INFO")
     # Pavement of 100 m by 100 m, and 50 m away a square of 20 m and one of 10 m.
     squares = ((50, 50, 50), (160, 50, 10), (160, 90, 5))
     box_map = map_of(*(("Sidewalks", (x, y, -0.1), (half, half, 0.1)) for x, y, half in squares))
-    found = walkable_ground(box_map, PedestriansConfig(safety_radius_m=0))
-    assert np.count_nonzero(found.parts) == 200 * 200
-    text = "2000 walkable cells in areas below pedestrians.min_component_cells=4000 are not used (areas: 2)"
-    assert text in caplog.text
+    write_boxes(tmp_path / "map.json", box_map)
+    cfg = PedestriansConfig(safety_radius_m=0, num_paths=1)
+    product = run(cfg, tmp_path / "map.json", tmp_path / "out")
+    ground = json.loads(product.with_name("pedestrians_report.json").read_text())["ground"]
+    assert (ground["cells_walkable"], ground["cells_used"]) == (200 * 200 + 2000, 200 * 200)
+    assert caplog.text.count("5 % of the walkable ground is in areas too small") == 1
     caplog.clear()
-    assert np.count_nonzero(walkable_ground(box_map, PedestriansConfig(safety_radius_m=0, min_component_cells=1)).parts)
-    assert "are not used" not in caplog.text
+    run(cfg.model_copy(update={"min_component_cells": 1}), tmp_path / "map.json", tmp_path / "all")
+    assert "too small" not in caplog.text
 
 
 @pytest.mark.parametrize(("number", "dt_s"), [*((k, DT_S) for k in range(6)), (6, 0.2), (7, 2.0)])

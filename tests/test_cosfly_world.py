@@ -145,6 +145,7 @@ def test_numbers_and_sizes_of_a_prompt_are_respected():
     assert np.ptp(town.boxes.bounds(), axis=0)[:2] == pytest.approx([300.0, 200.0], abs=0.5)
     assert town.boxes.maxs[of_kinds(town.boxes, "Buildings"), 2].max() <= 8.0
     assert (trace["not_used"], trace["not_respected"]) == ([], [])
+    assert {"12 detached houses", "2 fountains", "300 m x 200 m", "suburb"} <= set(trace["used"])
     assert all(one["is_met"] for one in check_world(town, plan) if one["check"].startswith(("number", "highest")))
 
 

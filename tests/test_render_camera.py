@@ -23,7 +23,7 @@ from cosfly.formats.playback_file import read_track, write_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.formats.weather import TIMES, WEATHERS, WeatherParams, resolved
 from cosfly.geometry.axes import intrinsic_matrix
-from cosfly.pipeline.runs import small_targets
+from cosfly.pipeline.runs import caveats
 from cosfly.pipeline.settings import RunConfig
 from cosfly.render.camera import ZoomConfig, legibility, zoomed_deg
 from cosfly.render.contract import PERSON_ID
@@ -271,11 +271,11 @@ def test_the_towns_of_a_run_have_weather_seeds_of_their_own():
 
 
 def test_a_configuration_in_which_the_target_is_small_is_remarked_on():
-    assert small_targets(RunConfig()) == []
-    [line] = small_targets(RunConfig.model_validate({"render": {"width_px": 320, "height_px": 180}}))
+    assert caveats(RunConfig()) == []
+    [line] = caveats(RunConfig.model_validate({"render": {"width_px": 320, "height_px": 180}}))
     assert "lower than 16 px in pictures (follow " in line
     mostly = {"plan": {"styles": {"follow": 90, "top": 10}}, "render": {"width_px": 640, "height_px": 360}}
-    assert small_targets(RunConfig.model_validate(mostly)) == []
+    assert caveats(RunConfig.model_validate(mostly)) == []
 
 
 def test_legible_is_what_the_bounds_say():

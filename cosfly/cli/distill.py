@@ -121,7 +121,7 @@ def evaluate(
     job.finish(product, out)
 
 
-FLYING = "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR; baselines: track_straight, random; ceiling: planner."
+FLYING = "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR, policy:MODULE:CLASS, track_straight, random, planner."
 
 
 @command(
@@ -138,7 +138,6 @@ def fly(
     map_: Annotated[Path | None, Option("--map", help="Boxes that are drawn: boxes_3d.json.")] = None,
     paths: Annotated[Path | None, Option(help="Pedestrian trajectories: path.json.")] = None,
     env: Annotated[str | None, Option(help="Benchmark instead of map and paths: cosfly/Follow-v0.")] = None,
-    policy: Annotated[str | None, Option(metavar="MODULE:CLASS", help="Policy to import and run.")] = None,
     simplified: Annotated[Path | None, Option(help="Simplified map for collisions; by default --map.")] = None,
     others: options.Bystanders = None,
     relabel: Annotated[Path | None, Option(help="Output of `cosfly fly` to relabel by the planner.")] = None,
@@ -147,15 +146,10 @@ def fly(
     from cosfly.closed_loop.stage import ClosedLoopConfig
 
     cfg = job.cfg
-    fly = cfg.fly
-    if policy:
-        if fly.student != "rules" or "fly.student" in job.set_by_options:
-            raise typer.BadParameter("pass either --policy or --student, not both")
-        fly = fly.model_copy(update={"student": f"policy:{policy}"})
-    run = ClosedLoopConfig(fly=fly, plan=cfg.plan, render=cfg.render, caption=cfg.caption, infer=cfg.distill.infer)
+    run = ClosedLoopConfig(fly=cfg.fly, plan=cfg.plan, render=cfg.render, caption=cfg.caption, infer=cfg.distill.infer)
     if relabel is not None:
-        if map_ is None or paths or env or policy:
-            raise typer.BadParameter("--relabel needs --map, and does not allow --paths, --env and --policy")
+        if map_ is None or paths or env:
+            raise typer.BadParameter("--relabel needs --map, and does not allow --paths and --env")
         job.run("cosfly.closed_loop.relabel", run, relabel, map_, simplified or map_, out)
     elif env is not None:
         if map_ or paths or simplified or others:
@@ -178,8 +172,6 @@ def leaderboard(
     out: options.Out,
 ) -> None:
     """Compare students: figures with intervals, floors and a ceiling."""
-    named_folders = []
-    for text in folders:
-        name, separator, folder = text.partition("=")
-        named_folders.append((name, Path(folder)) if separator else ("", Path(text)))
-    job.run("cosfly.closed_loop.leaderboard", named_folders, out)
+    parts = (text.partition("=") for text in folders)
+    named = [(name, Path(folder)) if equals else ("", Path(name)) for name, equals, folder in parts]
+    job.run("cosfly.closed_loop.leaderboard", named, out)

@@ -6,7 +6,7 @@ import contextlib
 import functools
 import importlib
 import logging
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -106,7 +106,6 @@ class Job:
     """The resolved settings of a command."""
 
     cfg: RunConfig
-    set_by_options: Collection[str] = ()  # names of the settings that the user set by options of the command
 
     def call(self, target: str, *arguments: Any, **keywords: Any) -> Any:
         """Import a function and call it with the arguments, and with the common arguments that it takes.
@@ -232,9 +231,8 @@ def command(
             cfg = resolve(values["config"], values["overrides"], settings, used_sections)
             if "town" in common_names:
                 cfg = _town_of(cfg, values["town"])
-            job = Job(cfg, settings)
             try:
-                function(job, **{name: _opened(cfg, values[name]) for name in own_names})
+                function(Job(cfg), **{name: _opened(cfg, values[name]) for name in own_names})
             except EOFError as error:  # click would print "Aborted." alone
                 raise RuntimeError("a file or the input ends too early") from error
 

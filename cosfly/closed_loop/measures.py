@@ -96,7 +96,7 @@ def episode_digest(episode: Episode) -> str:
     return sha256_bytes(dump_json(task).encode())
 
 
-def score_episodes(records: Iterable[Episode], *, seed: int = 0) -> Score:
+def score_episodes(records: Iterable[Episode], *, seed: int = 0, most_decisions: int = 0) -> Score:
     """Score the episodes of one student, at least one, in any order."""
     measured = []
     digests = []
@@ -107,7 +107,7 @@ def score_episodes(records: Iterable[Episode], *, seed: int = 0) -> Score:
     figures = figures_of(measured, rng_for(seed, "score", "draws"))
     return Score(
         episodes_sha256=sha256_bytes(dump_json(sorted(digests)).encode()),
-        student=episode.student, engine=episode.engine, list_sha256=episode.list_sha256,
+        student=episode.student, engine=episode.engine, list_sha256=episode.list_sha256, most_decisions=most_decisions,
         confidence=CONFIDENCE, resamples=RESAMPLES, figures=figures, flights=tuple(measured),
     )  # fmt: skip
 

@@ -69,7 +69,7 @@ class Policy:
         except Exception as error:
             raise InputError(
                 "the policy class cannot be imported or created",
-                where="--policy",
+                where="fly.student",
                 got=f"{spec}: {type(error).__name__}: {error}",
                 expected="a module:Class in the current directory, with reset(goal, seed) and act(observation)",
             ) from error

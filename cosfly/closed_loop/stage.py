@@ -155,16 +155,17 @@ def run(
         plans = planning.run(cfg.plan, simplified, paths, out / PLAN, **common)
         num_workers = 1 if cfg.fly.asks_model else workers
         traces = read_traces(plans)
-        reasons = [_drop_reason(trace, cfg.fly) for trace in traces]
+        num_lead = cfg.fly.lead_frames
+        reasons = [trace.drop_reason or ("too_short" if len(trace.time_s) <= num_lead else None) for trace in traces]
         flown = [n for n, reason in enumerate(reasons) if reason is None]
         dropped = Counter(reason for reason in reasons if reason is not None)
         if not flown:
-            expected = f"at least one accepted trajectory of more than {cfg.fly.lead_frames} frames (fly.lead_frames)"
+            expected = f"at least one accepted trajectory of more than {num_lead} frames (fly.lead_frames)"
             raise stage.nothing_kept(Tally(input=len(traces), dropped=dropped), expected=expected)
         # Neighbours in one batch share the lit area of the renderer.
         ordered = sorted(flown, key=lambda n: (Airspace.area_of(traces[n].targets_m), n))
         num_frames = {n: len(_cut(traces[n], cfg.fly).time_s) for n in flown}
-        episodes = [ListedEpisode(traces[n].path_id, n, num_frames[n] - cfg.fly.lead_frames) for n in ordered]
+        episodes = [ListedEpisode(traces[n].path_id, n, num_frames[n] - num_lead) for n in ordered]
         batch = min(cfg.fly.batch, math.ceil(len(flown) / num_workers))
         start = partial(open_map, cfg, seed, boxes, simplified, plans, others)
         fly_episodes(stage, cfg, [episodes], batch, start, seed, num_workers, watch)
@@ -202,7 +203,8 @@ def fly_episodes(
             num_steps = sum(episode.num_steps for episode in episodes)
             items.append(Item(f"{episodes[0].name} and {len(episodes) - 1}", payload, num_steps))
     worker_args = (cfg, start, stage.path, seed, num_workers, list_sha256)
-    run_items(stage, items, make_worker, worker_args, workers=num_workers, watch=watch_of(cfg.fly, watch))
+    watch = watch_of(cfg.fly, watch)
+    run_items(stage, items, make_worker, worker_args, workers=num_workers, watch=watch, label="fly: decisions")
 
 
 def make_worker(
@@ -264,15 +266,17 @@ def finish_episodes(
         flown = [trace_of(read_episode(path), obstacles) for path in files]
         write_traces(stage.path / TRACES, flown, {"student": fly.student, "seed": seed})
         outputs.append(stage.path / TRACES)
-    score = score_episodes(map(read_episode, files), seed=seed)
+    score = score_episodes(map(read_episode, files), seed=seed, most_decisions=fly.most_decisions)
     write_model(stage.path / SCORE, score, SCORE_FORMAT)
     ended = Counter[str](episode.ended for episode in score.flights)
     decisions = sum(sum(episode.answers.values()) for episode in score.flights)
     stage.finish(outputs, tally, flown=dict(sorted(ended.items())) | {"decisions": decisions})
     log.info(
-        "fly: %s: target in the picture in %.1f %%, visible in %.1f %% of the frames; %s; %d decisions",
+        "fly: %s: target in the picture in %.1f %%, visible in %.1f %% of the frames; %s; %d decisions%s; see %s",
         fly.student, *(100 * (score.figures[name].value or 0.0) for name in ("in_picture", "in_view")),
         ", ".join(f"{count} {end}" for end, count in sorted(ended.items())), decisions,
+        f" (episodes shortened by fly.most_decisions={fly.most_decisions})" if fly.most_decisions else "",
+        stage.path / SCORE,
     )  # fmt: skip
 
 
@@ -295,13 +299,6 @@ def open_map(
         )
 
     return open_episode
-
-
-def _drop_reason(trace: DroneTrace, cfg: FlyConfig) -> str | None:
-    """Return why a plan is not flown; None if it is."""
-    if trace.drop_reason:
-        return trace.drop_reason
-    return "too_short" if len(trace.time_s) <= cfg.lead_frames else None
 
 
 def _cut(trace: DroneTrace, cfg: FlyConfig) -> DroneTrace:

@@ -144,6 +144,7 @@ class Score(Record):
     engine: str
     episodes_sha256: str  # of the tasks; only scores with equal ones are comparable
     list_sha256: str | None = None  # of the published list; None for own trajectories
+    most_decisions: NonNegativeInt = 0  # as `fly.most_decisions`, which shortens episodes; 0: whole episodes
     confidence: Annotated[FiniteFloat, Field(gt=0, lt=1)]
     resamples: int = Field(ge=1)
     figures: dict[str, Figure]  # by measures.MEASURES

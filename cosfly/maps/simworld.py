@@ -167,7 +167,7 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
         else:
             size_sources[_add_node(boxes, node, asset, size_cm, stand_m, world)] += 1
     if has_surfaces and roads:  # the world has its roads as surfaces
-        dropped.counts["road_piece"] = len(roads)
+        dropped.counts["repeated_road"] = len(roads)
     expected = (
         f"at most {cfg.most_skipped:.0%} of the objects without a kind or size (maps.simworld.most_skipped); sizes are "
         "in the tables of maps.simworld.sizes, kinds in cosfly/simulators/assets.yaml"

@@ -1,6 +1,5 @@
 """Stage 1: a map of boxes. Each source is a module with `load(its settings, seed) -> BoxMap`."""
 
-import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -23,8 +22,6 @@ from cosfly.runtime.config import Config
 from cosfly.runtime.io import LinkedPath, write_bytes
 from cosfly.runtime.run_dir import StageFolder, Tally
 from cosfly.viz.topview import TopView, draw_map, png_bytes
-
-log = logging.getLogger(__name__)
 
 PICTURE_PX = 1200  # longer side of the overview picture
 
@@ -88,10 +85,7 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, follow_links: bool = False
         outputs += unrealcv_export.write_objects(box_map, out)
     write_bytes(out / "map.png", png_bytes(draw_map(box_map, TopView.around(np.stack(box_map.bounds()), PICTURE_PX))))
     dropped = box_map.header.dropped_objects
-    num_objects = box_map.header.num_objects
-    if num_objects is None:
-        num_objects = len(box_map)
+    num_objects = box_map.header.num_objects or len(box_map)
     tally = Tally(input=num_objects, kept=num_objects - sum(dropped.values()), dropped=dropped)
-    log.info("the map has %d boxes of %d objects", len(box_map), num_objects)
     stage.finish(outputs, tally, num_boxes=len(box_map), counts_by_kind=box_map.counts())
     return product

@@ -47,6 +47,7 @@ log = logging.getLogger(__name__)
 STAGE = "pedestrians"
 REPORT_FORMAT = FileFormat("cosfly.pedestrians_report", "1.0")
 RETRY_REASONS = ("no_goal", "detour")
+UNUSED_SHARE = 0.01  # of the walkable ground; less is not worth a line of the log
 
 # The overview picture: RGB of cells and of the outline of the region of interest.
 LONGER_SIDE_PX = 1600
@@ -215,6 +216,10 @@ def run(
         box_map = read_boxes(simplified_map)
         region = read_roi(roi) if roi else None
     ground = walkable_ground(box_map, cfg, region, where=simplified_map, roi_where=roi or "", seconds=seconds)
+    unused_share = 1 - ground.counts["cells_used"] / ground.counts["cells_walkable"]
+    if unused_share >= UNUSED_SHARE:
+        words = "%.0f %% of the walkable ground is in areas too small to walk in (pedestrians.min_component_cells=%d)"
+        log.info(words, 100 * unused_share, cfg.min_component_cells)
     items = [Item(walk_id(k), pace) for k, pace in enumerate(paces_of(cfg.num_paths, cfg.pace, seed))]
     # Workers need the labels only; sending the rest takes time.
     ground_of_workers = replace(ground, inflated=ground.grid, is_in_roi=None)
@@ -239,8 +244,8 @@ def run(
         write_json(out / "pedestrians_report.json", summary)
         share = summary["total"]["on_carriageway_share"]
         if share and cfg.road_cost == 1:
-            words = "people are on carriageways, away from crossings, at %.1f %% of the points; "
-            log.info(words + "pedestrians.road_cost=20 prefers pavements", 100 * share)
+            words = "%.1f %% of the points are on carriageways, away from crossings; "
+            log.info(words + "set pedestrians.road_cost=20 to keep people on pavements", 100 * share)
         write_bytes(out / "paths.png", draw_overview(ground, paths))
     rounded = {step: round(value, 4) for step, value in seconds.items()}
     stage.finish(outputs, outcomes.tally, ground=ground.counts, total=summary["total"], seconds_by_step=rounded)

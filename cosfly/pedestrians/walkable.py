@@ -235,7 +235,7 @@ def walkable_ground(
     }
     _check_walkable(counts, where, roi_where)
     with timed(seconds, "connectivity"):
-        parts, component_counts = _parts_of_large_components(walkable, cfg, where, where if roi is None else roi_where)
+        parts, component_counts = _parts_of_large_components(walkable, cfg, where if roi is None else roi_where)
     with timed(seconds, "footing"):
         costs = costs_of(cfg.road_cost)
         footing = footing_of(box_map, grid)
@@ -288,27 +288,22 @@ def _surface(box_map: BoxMap, ground: str, grid: grids.OccupancyGrid, free: np.n
 
 
 def _parts_of_large_components(
-    walkable: np.ndarray, cfg: PedestriansConfig, where: str | Path, error_where: str | Path
+    walkable: np.ndarray, cfg: PedestriansConfig, where: str | Path
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """Label the parts of the large components; return them and the counts of components; log the small ones."""
+    """Label the parts of the large components; return them and the counts of components."""
     components, sizes = grids.connected_parts(walkable, 8)
     is_large = sizes >= cfg.min_component_cells
     if not is_large.any():
         raise NoPathError(
-            "no connected walkable area is large enough", where=error_where,
+            "no connected walkable area is large enough", where=where,
             got=f"{int(sizes.max())} cells of {cfg.resolution_m:g} m in the largest of {len(sizes) - 1} areas",
             expected=f"at least {cfg.min_component_cells} cells (pedestrians.min_component_cells)",
             fix="lower pedestrians.min_component_cells or pedestrians.safety_radius_m, or widen the region of interest",
         )  # fmt: skip
     parts, part_sizes = grids.connected_parts(is_large[components], 4)
     used = sorted(sizes[is_large].tolist(), reverse=True)
-    num_components = len(sizes) - 1
-    num_unused = _count(walkable) - sum(used)
-    if num_unused:
-        text = "%s: %d walkable cells in areas below pedestrians.min_component_cells=%d are not used (areas: %d)"
-        log.info(text, where, num_unused, cfg.min_component_cells, num_components - len(used))
     return parts, {
-        "components": num_components, "components_used": len(used), "component_sizes_used": used,
+        "components": len(sizes) - 1, "components_used": len(used), "component_sizes_used": used,
         "cells_used": sum(used), "parts": len(part_sizes) - 1,
     }  # fmt: skip
 

@@ -97,7 +97,7 @@ def _stage(name: str, folder: Path) -> StageSummary:
 # --- estimates --------------------------------------------------------------------------------------------------------
 
 # Measured in `cosfly run showcase` (docs/benchmarks.md; 2 cores, AMD EPYC, idle): 3 pedestrians, 858 frames of
-# 0.9216 Mpx, 804 windows by `rules`. Rates of frames are per million pixels; their disk space is that of `quickstart`.
+# 0.9216 Mpx, 804 windows by `rules`. Rates of frames are per million pixels; their disk space is that of `diverse`.
 BASIS = "`cosfly run showcase` on a 2-core machine (docs/benchmarks.md)"
 
 
@@ -114,13 +114,13 @@ RATES = {
     "simplify": Rate("map", 1.4, 1.2),
     "pedestrians": Rate("pedestrians", 4.6 / 3, 0.3 / 3),
     "plan": Rate("pedestrians", 2.3 / 3, 0.4 / 3),
-    "render": Rate("frames", 51.2 / 790.7, 1.95),
+    "render": Rate("frames", 51.2 / 790.7, 2.3),
     "inspect": Rate("frames", 26.8 / 790.7, 0.7 / 790.7),
     "caption": Rate("windows", 4.0 / 804, 7.4 / 804),
-    "release": Rate("frames", 25.4 / 790.7, 1.95),
+    "release": Rate("frames", 25.4 / 790.7, 2.3),
 }
 START_S = 2.0  # of a stage and its workers, which `showcase` hides: inspect and release of `quickstart` take 2 to 4 s
-WALK_MPS = 1.0  # progress along the straight line from start to goal, with detours and stops
+WALK_MPS, PAVEMENT_MPS = 1.0, 0.7  # progress along the straight line from start to goal; with road_cost above 1
 PERSON_M, PERSON_DEPTH_M = 1.75, 0.45  # height of a person, and extent in the plane
 SMALL_SHARE = 0.2  # of the time
 
@@ -160,7 +160,8 @@ def num_frames(cfg: RunConfig, out: Path) -> list[int]:
         num_points = [len(trace.time_s) for trace in traces if trace.drop_reason is None]
     else:
         walking = cfg.pedestrians
-        duration_s = 0.5 * (walking.min_distance_m + walking.max_distance_m) / WALK_MPS
+        speed_mps = WALK_MPS if walking.road_cost == 1 else PAVEMENT_MPS
+        duration_s = 0.5 * (walking.min_distance_m + walking.max_distance_m) / speed_mps
         num_points = [round(duration_s / walking.dt_s)] * walking.num_paths
     return [math.ceil(count / cfg.render.frame_stride) for count in num_points]
 
@@ -216,8 +217,8 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
     lines = [
         f"estimates are based on {BASIS}",
         f"total: about {time}; {in_words(needed)} of disk space ({in_words(free)} are free)",
+        *caveats(cfg),
     ]
-    lines += caveats(cfg)
     if unknown:
         lines.append("run cosfly caption --limit 10: its report has the tokens and cost of a caption")
     if needed > free:
@@ -226,14 +227,10 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
 
 
 def caveats(cfg: RunConfig) -> list[str]:
-    """Return remarks on settings that apply to some trajectories only, and on targets too small to see."""
-    return [*cfg.plan.remarks(), *small_targets(cfg)]
+    """Return remarks on settings that apply to some trajectories only, and on targets too small to see.
 
-
-def small_targets(cfg: RunConfig) -> list[str]:
-    """Return a remark if the target is lower than LEGIBLE_HEIGHT_PX in the styles of SMALL_SHARE of the time or more.
-
-    Distances, altitudes and fields of view are the middles of their ranges.
+    Too small: lower than LEGIBLE_HEIGHT_PX in the styles of SMALL_SHARE of the time or more. Distances, altitudes and
+    fields of view are the middles of their ranges.
     """
     plan, render = cfg.plan, cfg.render
     fov_deg = sum(render.fovs_deg) / len(render.fovs_deg)
@@ -249,11 +246,12 @@ def small_targets(cfg: RunConfig) -> list[str]:
         if share > 0 and height_px < LEGIBLE_HEIGHT_PX:
             small[f"{name} {height_px:.0f} px"] = share
     if sum(small.values()) < SMALL_SHARE * sum(plan.styles.values()):
-        return []
+        return cfg.plan.remarks()
     return [
+        *cfg.plan.remarks(),
         f"the target is lower than {LEGIBLE_HEIGHT_PX:g} px in pictures ({', '.join(small)}), so it can hardly be "
         "recognized. Choose larger pictures (render.width_px), a narrower field of view (render.fovs_deg), or smaller "
-        "distances (plan.behind_distance_m, plan.altitude_preferred_m, plan.style_ranges)"
+        "distances (plan.behind_distance_m, plan.altitude_preferred_m, plan.style_ranges)",
     ]
 
 

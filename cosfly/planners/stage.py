@@ -324,7 +324,8 @@ def run(
     header = {"map": box_map.name, "planner": cfg.planner, "seed": seed, "settings": cfg.recorded()}
     for trace in traces:
         if trace.not_held:
-            log.warning("%s: dropped, because the drone does not hold the style: %s", trace.path_id, trace.not_held)
+            outcome = "dropped" if trace.drop_reason else f"flown in the style {cfg.styles_fallback}"
+            log.warning("%s: %s, because the drone does not hold its style: %s", trace.path_id, outcome, trace.not_held)
     write_traces(product, traces, header)
     write_bytes(picture, draw_trajectories(box_map, pedestrians, traces))
     times_ms = 1000.0 * np.array([record.seconds for record in records])  # not in the product, which is reproducible

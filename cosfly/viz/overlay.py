@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import shapely
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import FrameMeta
@@ -38,18 +39,6 @@ class _Label(NamedTuple):
     x: float  # px, of its middle
     y: float  # px, of the top of the box
     color: Color
-
-
-class _Area(NamedTuple):
-    """A rectangle of the picture, px."""
-
-    x0: float
-    y0: float
-    x1: float
-    y1: float
-
-    def overlaps(self, other: _Area) -> bool:
-        return self.x0 < other.x1 and other.x0 < self.x1 and self.y0 < other.y1 and other.y0 < self.y1
 
 
 class _Box(NamedTuple):
@@ -147,7 +136,7 @@ def _clipped(end: np.ndarray, other_end: np.ndarray, near_m: float) -> np.ndarra
 def _write_labels(picture: np.ndarray, labels: list[_Label], size: float) -> None:
     """Write labels into a picture, in place. A label that overlaps a later one of the list is skipped."""
     height_px, width_px = picture.shape[:2]
-    taken: list[_Area] = []
+    taken: list[shapely.Polygon] = []
     for label in reversed(labels):
         # A box may begin above the picture: then its label is written at the upper edge.
         if not (0 <= label.x < width_px and -height_px / 2 <= label.y < height_px):
@@ -155,9 +144,11 @@ def _write_labels(picture: np.ndarray, labels: list[_Label], size: float) -> Non
         (text_width_px, text_height_px), _ = cv2.getTextSize(label.text, FONT, size, 1)
         left = float(np.clip(label.x - text_width_px / 2, 2, max(2, width_px - text_width_px - 2)))
         baseline = float(np.clip(label.y - LABEL_GAP_PX, text_height_px + 2, height_px - 4))
-        area = _Area(left - 2, baseline - text_height_px - 2, left + text_width_px + 2, baseline + 3)
-        if any(area.overlaps(other) for other in taken):
+        low = round(left - 2), round(baseline - text_height_px - 2)
+        high = round(left + text_width_px + 2), round(baseline + 3)
+        area = shapely.box(*low, *high)
+        if any(area.intersects(other) for other in taken):
             continue
         taken.append(area)
-        cv2.rectangle(picture, (round(area.x0), round(area.y0)), (round(area.x1), round(area.y1)), LABEL_BACKGROUND, -1)
+        cv2.rectangle(picture, low, high, LABEL_BACKGROUND, -1)
         draw_text(picture, label.text, left, baseline, size, label.color)

@@ -10,6 +10,7 @@ from typing import Self
 
 import cv2
 import numpy as np
+import shapely
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KIND_NAMES
@@ -106,6 +107,26 @@ def draw_text(
             cv2.putText(picture, text, (left + dx, base + dy), FONT, scale, halo, 1, cv2.LINE_AA)
     cv2.putText(picture, text, (left, base), FONT, scale, color, 1, cv2.LINE_AA)
     return left + width
+
+
+def draw_labels(picture: np.ndarray, labels: Sequence[tuple[str, np.ndarray]]) -> None:
+    """Write names at their places, (2,) px; a name that would cover another name or place is moved, with a line."""
+    frame = shapely.box(0, 0, picture.shape[1], picture.shape[0])
+    taken: list[shapely.Geometry] = [shapely.Point(place).buffer(6) for _, place in labels]
+    offsets = [r * np.array([np.cos(a), np.sin(a)]) for r in range(0, 400, 8) for a in np.linspace(-np.pi, np.pi, 17)]
+    for k, (name, place) in enumerate(labels):
+        (width, height), _ = cv2.getTextSize(name, FONT, 0.55, 1)
+        others = shapely.union_all(taken[:k] + taken[k + 1 :])
+        half = np.array([width + 6, height + 8]) / 2
+        middles = ((middle, shapely.box(*(middle - half), *(middle + half))) for middle in place + offsets)
+        free = ((middle, box) for middle, box in middles if frame.contains(box) and not box.intersects(others))
+        middle, box = next(free, (place, taken[k]))
+        taken.append(box)
+        if line := list(shapely.LineString([place, middle]).difference(box).coords):
+            draw_line(picture, np.array(line), INK, halo=3)
+            draw_dot(picture, place, 3, INK)
+    for (name, _), box in zip(labels, taken[len(labels) :], strict=True):
+        draw_text(picture, name, box.centroid.x, box.bounds[3] - 4, align=0.5, halo=HALO)
 
 
 def add_caption(picture: np.ndarray, text: str) -> np.ndarray:

@@ -106,6 +106,7 @@ class _Reader:
         self.prompt = prompt
         self.text = _normalized(prompt)  # what is not read yet
         self.plan: dict[str, Any] = WorldPlan().model_dump()  # its fields so far
+        self.used: list[str] = []
         self.not_used: list[str] = []
         self.not_respected: list[str] = []
         # What is read by `_take_phrases`.
@@ -131,7 +132,10 @@ class _Reader:
         for words in (*towns, WORDS["patterns"].get(self.pattern, "")):
             self._take_words(words)
         if self.text == whole_text and not self.absent:
-            self._refuse()
+            what = "the rule-based planner recognises no word of this prompt"
+            expected = "an English description, such as 'a small village with a church'"
+            fix = "name a kind of place, or use a language model with --planner URL"
+            raise InputError(what, where="PROMPT", got=repr(self.prompt[:60]), expected=expected, fix=fix)
         self.plan["pattern"] = self.pattern or settlement["patterns"][seed % len(settlement["patterns"])]
         self._set_buildings(settlement, choices, has_open)
         # The seed varies what settlement and choices set; then comes what the prompt measures, which does not vary.
@@ -150,16 +154,10 @@ class _Reader:
             "planner": "rules", "settlement": place, "settlement_is_named": bool(self.named or any(implied)),
             "pattern": plan.pattern, "pattern_is_named": self.pattern is not None,
             "objects": self.objects, "without": self.absent, **choices,
+            "used": [words for words in self.used if words not in self.not_used],
             "not_used": plan.not_used, "not_respected": self.not_respected,
         }  # fmt: skip
         return plan, trace
-
-    def _refuse(self) -> None:
-        """Raise the error of a prompt of which nothing is read."""
-        what = "the rule-based planner recognises no word of this prompt"
-        expected = "an English description, such as 'a small village with a church'"
-        fix = "name a kind of place, or use a language model with --planner URL"
-        raise InputError(what, where="PROMPT", got=repr(self.prompt[:60]), expected=expected, fix=fix)
 
     # --- phrases of the text ---
 
@@ -170,6 +168,8 @@ class _Reader:
         """Return the first match of a pattern, and put `keep` in its place."""
         if match := re.search(pattern, self.text):
             self.text = f"{self.text[: match.start()]} {match.expand(keep)} {self.text[match.end() :]}"
+            if keep == ",":
+                self.used.append(match[0].strip())
         return match
 
     def _take_named(self, patterns: dict[str, str]) -> dict[str, re.Match[str]]:
@@ -195,10 +195,8 @@ class _Reader:
         match = self._take(rf"{number}\b({word}|{plural})\b(?!-)", keep=r", \2 ,")
         if match is None:
             return None
-        count = int(match[1] or 0)
-        if count:
-            return count
-        return 1 if match[3] == word else plural_count
+        self.used.append(f"{match[1] or ''} {match[3]}".strip())
+        return int(match[1] or 0) or (1 if match[3] == word else plural_count)
 
     def _take_phrases(self) -> None:
         """Take measures and nouns. Each is taken before those that would misread it."""
@@ -277,6 +275,8 @@ class _Reader:
             if self._has(word):
                 self.plan[field] = width_m
         for word, field in WORDS["open"].items():
+            if re.search(rf"\b{word}s?\b", self.absent):
+                self.plan[field] = 0
             # "Houses with gardens" means no several blocks.
             count = self._take_counted(word, plural_count=1 if word in ("garden", "lawn") else SEVERAL_OPEN)
             if count is not None:

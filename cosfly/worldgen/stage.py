@@ -24,7 +24,7 @@ from cosfly.runtime.io import sha256_bytes, write_bytes
 from cosfly.runtime.json_io import FileFormat, validated, write_json, write_model
 from cosfly.runtime.model_json import find_object
 from cosfly.runtime.run_dir import StageFolder, Tally, hold_folder
-from cosfly.viz.topview import HALO, TopView, draw_map, draw_text, png_bytes
+from cosfly.viz.topview import TopView, draw_labels, draw_map, png_bytes
 from cosfly.worldgen.plan import OBJECTS, PLAN_FORMAT, WorldPlan, assets
 from cosfly.worldgen.rules import plan_by_rules
 from cosfly.worldgen.town import CM_PER_M, Town, build, layout_nodes, of_kinds, placement_nodes, trees_of
@@ -113,12 +113,10 @@ def _problems(checks: list[WorldCheck], town: Town, trace: dict[str, Any]) -> st
         for check in checks if not check["is_met"]
     ]  # fmt: skip
     missing = Counter(f"{name} ({reason})" for name, reason in town.not_placed)
-    numbers = [phrase for phrase in trace["not_used"] if re.match(r"\d+ \(of ", phrase)]
     lists = {
         "not respected": trace.get("not_respected", []) + unmet,
         "not placed": [f"{count} x {name}" if count > 1 else name for name, count in missing.items()],
-        "words not used": [phrase for phrase in trace["not_used"] if phrase not in numbers],
-        "numbers not used": numbers,
+        "words not used": trace["not_used"],
     }
     parts = [f"{title}: {', '.join(phrases)}" for title, phrases in lists.items() if phrases]
     if not trace.get("settlement_is_named", True):
@@ -192,10 +190,15 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks, **unread})
     write_bytes(out / "map.png", _picture(town, plan))
     _write_settings(cfg.name, product, out / LOOP_FILE)
+    if "used" in trace:
+        log.info("words used: %s", ", ".join(trace["used"]))
     if problems := _problems(checks, town, trace):
         log.warning("%s", problems)
-    if town.placed:
-        log.info("placed: %s", counts_text(Counter(obj.name for obj in town.placed)))
+    by_seed = "" if trace.get("pattern_is_named", True) else " (chosen by the seed)"
+    water = f" and water {plan.river_m:g} m wide" if plan.river_m else ""
+    counts = Counter({"plaza": plan.plazas, "green": plan.greens}) + Counter(obj.name for obj in town.placed)
+    place = trace.get("settlement", "town")
+    log.info("the %s has %s streets%s%s; placed: %s", place, plan.pattern, by_seed, water, counts_text(counts))
     num_kept = 1 + len(town.placed)
     dropped = Counter(reason.replace(" ", "_") for _, reason in town.not_placed)
     tally = Tally(input=num_kept + len(town.not_placed), kept=num_kept, dropped=dropped)
@@ -211,13 +214,11 @@ def _picture(town: Town, plan: WorldPlan) -> bytes:
     view = TopView.around(np.stack(town.boxes.bounds()), PICTURE_PX)
     picture = draw_map(town.boxes, view)
     block_names = ["plaza"] * plan.plazas + ["green"] * plan.greens  # in the order of the open blocks
-    objects = [obj for obj in town.placed if OBJECTS[obj.name].where != "layout"]
-    labels = [(obj.name, obj.xy) for obj in objects if obj.number == 0]
+    labels = [(obj.name, obj.xy) for obj in town.placed if obj.number == 0 and OBJECTS[obj.name].where != "layout"]
     for name, block in zip(block_names, town.open_blocks, strict=False):
-        if not any(block.covers(shapely.Point(obj.xy)) for obj in objects):
+        if not any(block.covers(shapely.Point(xy)) for _, xy in labels):
             labels.append((name, block.centroid.coords[0]))
-    for name, xy in labels:
-        draw_text(picture, name, *view.pixels(np.array([xy]))[0], align=0.5, halo=HALO)
+    draw_labels(picture, [(name, view.pixels(np.array([xy]))[0]) for name, xy in labels])
     return png_bytes(picture)
 
 
