@@ -52,12 +52,6 @@ from cosfly.runtime.json_io import (
 
 log = logging.getLogger(__name__)
 
-ITEMS = {  # what a stage counts
-    "maps": "objects", "simplify": "maps", "pedestrians": "trajectories", "plan": "trajectories", "render": "tracks",
-    "inspect": "tracks", "caption": "windows", "release": "tracks", "fly": "episodes", "leaderboard": "students",
-    "world": "towns and objects",
-}  # fmt: skip
-
 LOCK = ".lock"
 STAGE_FORMAT = FileFormat("cosfly.stage", "1.0", "stage record")
 MANIFEST_FORMAT = FileFormat("cosfly.manifest", "1.0", "manifest")
@@ -347,7 +341,7 @@ class StageFolder:
         write_model(self.path / "manifest.json", manifest, MANIFEST_FORMAT)
         if self._lock is not None:
             self._lock.release()
-        log.info("%s: %s %s, %.1f s", self.stage, tally, ITEMS.get(self.stage, "items"), seconds)
+        log.info("%s: %s, %.1f s", self.stage, tally, seconds)
 
     def nothing_kept(
         self, tally: Tally, *, expected: str | None = None, where: Path | None = None, fix: str | None = None
