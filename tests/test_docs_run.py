@@ -207,7 +207,6 @@ def small_run(name: str) -> dict[str, Any]:
     if "towns" in value:
         value["render"].update(frame_stride=2)
     value.setdefault("maps", {}).setdefault("synthetic", {}).update(size_m=150, num_blocks=1)
-    value.get("distill", {}).get("train", {}).pop("random_student", None)  # the smallest there is
     value["towns"] = dict(list(value.get("towns", {}).items())[:3])  # a split each
     return value
 

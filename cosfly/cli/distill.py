@@ -13,7 +13,7 @@ from cosfly.cli.options import STAGE, Job, SettingOption, command
 options.add_group("distill", "Train a small student: training set, LoRA, inference, evaluation.")
 
 Dataset = Annotated[Path, Option(help="Training set: the output of `distill prepare`.")]
-STUDENTS = "Model folder, GGUF file, repository such as Qwen/Qwen3.5-2B, or random weights: tiny, random."
+STUDENTS = "Model folder, GGUF file, repository such as Qwen/Qwen3.5-2B, or tiny (random weights)."
 JUDGED = "captions.jsonl of `caption --teacher student:PATH`, one per tree; repeat it."
 LIMIT = SettingOption("distill.prepare.limit", "Windows in all splits, chosen at random; 0 for all.", int)
 

@@ -1,21 +1,19 @@
-"""Students of random weights in Qwen3.5's structure, from 0.3 million parameters up, with a tokenizer trained on the
-training set: for a try on a laptop, and for experiments with a student that knows nothing before."""
+"""A student of 0.3 million random weights in Qwen3.5's structure, with a tokenizer trained on the training set: for a
+try on a laptop."""
 
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field
-
 from cosfly.formats.captions import FIELDS, TOKENS
-from cosfly.runtime.config import Config
 from cosfly.runtime.io import atomic_folder
 from cosfly.runtime.seeding import rng_for
 from distill.student.model import quiet_transformers, require
 from distill.student.saving import writing_errors
 
-TINY, RANDOM = "tiny", "random"  # values of `--student`, as folders and names of repositories are
-LEAST_VOCABULARY = 800  # tokens
+TINY = "tiny"  # value of `--student`, as folders and names of repositories are
+VOCABULARY = 800  # tokens
+WIDTH, LAYERS = 64, 4  # of the language model; the vision tower has half of both
 START, END_OF_TURN, PAD = "<|im_start|>", "<|im_end|>", "<|endoftext|>"
 VISION_START, VISION_END, IMAGE, VIDEO = "<|vision_start|>", "<|vision_end|>", "<|image_pad|>", "<|video_pad|>"
 _CHAT_TEMPLATE = (
@@ -36,23 +34,9 @@ _TOKENIZER_TEXT = (
 )
 
 
-class RandomStudent(Config):
-    """Size of a student of random weights. The vision tower has half its width and half its number of layers."""
-
-    width: int = Field(64, ge=64, multiple_of=64, description="width of the language model")
-    layers: int = Field(
-        4, ge=4, multiple_of=4, description="layers of the language model; three of four have linear attention"
-    )
-
-
-TINY_STUDENT = RandomStudent()  # overfits a handful of captions within minutes on a CPU
-
-
-def make_random_student(
-    folder: Path, cfg: RandomStudent = TINY_STUDENT, seed: int = 0, texts: Iterable[str] = ()
-) -> Path:
-    """Write a randomly initialised student as a model folder. Its byte-level tokenizer is trained on the texts, besides
-    a few lines of our own."""
+def make_random_student(folder: Path, seed: int = 0, texts: Iterable[str] = ()) -> Path:
+    """Write a randomly initialised student as a model folder; it overfits a handful of captions within minutes on a
+    CPU. Its byte-level tokenizer is trained on the texts, besides a few lines of our own."""
     require("torch", "transformers")
     import torch
     from transformers import Qwen3_5ForConditionalGeneration
@@ -61,8 +45,8 @@ def make_random_student(
 
     quiet_transformers()
     empty: Any = {"vocab": {}, "merges": [], "eos_token": END_OF_TURN, "pad_token": PAD, "model_max_length": 32768}
-    lines, size = (*_TOKENIZER_TEXT, *texts), max(LEAST_VOCABULARY, 8 * cfg.width)
-    tokenizer = Qwen3_5Tokenizer(**empty).train_new_from_iterator(lines, size, show_progress=False)
+    lines = (*_TOKENIZER_TEXT, *texts)
+    tokenizer = Qwen3_5Tokenizer(**empty).train_new_from_iterator(lines, VOCABULARY, show_progress=False)
     tokenizer.add_special_tokens({"extra_special_tokens": [START, VISION_START, VISION_END, IMAGE, VIDEO]})
     tokenizer.chat_template = _CHAT_TEMPLATE
     sizes: Any = {"patch_size": 16, "merge_size": 2, "temporal_patch_size": 2}
@@ -70,9 +54,9 @@ def make_random_student(
     image_processor = Qwen2VLImageProcessorPil(**sizes, image_mean=[0.5] * 3, image_std=[0.5] * 3, size=areas)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng_for(seed, "distill.tiny_student", "weights").integers(2**31)))
-        model = Qwen3_5ForConditionalGeneration(model_config(cfg, tokenizer))
+        model = Qwen3_5ForConditionalGeneration(model_config(tokenizer))
         # Final norm and tied embeddings stay frozen under LoRA and bound the logits by |hidden| |embedding|, which is
-        # sqrt(width), hence the loss by 0.29 nats in the smallest; twice the length lets it be sure of an answer.
+        # sqrt(width), hence the loss by 0.29 nats; twice the length lets it be sure of an answer.
         with torch.no_grad():
             model.model.language_model.embed_tokens.weight.mul_(2.0)
     with atomic_folder(folder) as partial, writing_errors(partial):
@@ -81,28 +65,26 @@ def make_random_student(
     return folder
 
 
-def model_config(cfg: RandomStudent, tokenizer: Any) -> Any:
-    """Return the library's configuration of a student: heads and rotary sections as wide as its width allows."""
+def model_config(tokenizer: Any) -> Any:
+    """Return the library's configuration of a student."""
     from transformers import Qwen3_5Config
 
-    head = 128 if cfg.width >= 512 else 16  # wide students have heads as Qwen3.5's
-    heads = max(2, cfg.width // head)
-    section = head // 16  # of half of the rotary half of a head: a quarter each for height and width, the rest for time
+    head, heads = 16, WIDTH // 16
     rope = {"rope_type": "default", "rope_theta": 1e4, "partial_rotary_factor": 0.5, "mrope_interleaved": True}
-    rope["mrope_section"] = [head // 4 - 2 * section, section, section]
+    rope["mrope_section"] = [2, 1, 1]  # of half of the rotary half of a head: time, height, width
     text = {
-        "vocab_size": len(tokenizer), "hidden_size": cfg.width, "intermediate_size": 2 * cfg.width,
-        "num_hidden_layers": cfg.layers, "num_attention_heads": heads, "num_key_value_heads": heads // 2,
+        "vocab_size": len(tokenizer), "hidden_size": WIDTH, "intermediate_size": 2 * WIDTH,
+        "num_hidden_layers": LAYERS, "num_attention_heads": heads, "num_key_value_heads": heads // 2,
         "head_dim": head, "linear_key_head_dim": head, "linear_value_head_dim": head,
         "linear_num_key_heads": heads // 2, "linear_num_value_heads": heads,
-        "layer_types": (["linear_attention"] * 3 + ["full_attention"]) * (cfg.layers // 4),
+        "layer_types": ["linear_attention"] * 3 + ["full_attention"],
         "tie_word_embeddings": True, "rope_parameters": rope,
-        "initializer_range": cfg.width**-0.5,  # the usual 0.02 is for wide models
+        "initializer_range": WIDTH**-0.5,  # the usual 0.02 is for wide models
         "eos_token_id": tokenizer.eos_token_id, "pad_token_id": tokenizer.pad_token_id,
     }  # fmt: skip
     vision = {
-        "depth": cfg.layers // 2, "hidden_size": cfg.width // 2, "intermediate_size": cfg.width,
-        "num_heads": max(2, cfg.width // 128), "out_hidden_size": cfg.width, "num_position_embeddings": 64,
+        "depth": LAYERS // 2, "hidden_size": WIDTH // 2, "intermediate_size": WIDTH, "num_heads": 2,
+        "out_hidden_size": WIDTH, "num_position_embeddings": 64,
     }  # fmt: skip
     names = {"image": IMAGE, "video": VIDEO, "vision_start": VISION_START, "vision_end": VISION_END}
     marks: Any = {f"{name}_token_id": tokenizer.convert_tokens_to_ids(token) for name, token in names.items()}

@@ -8,7 +8,6 @@ from pydantic import Field, model_validator
 
 from cosfly.runtime.config import Config, MayDiffer
 from distill.student.model import Device, Dtype
-from distill.student.random_student import RandomStudent
 
 STAGE = "distill.train"
 
@@ -42,7 +41,6 @@ class TrainConfig(Config):
         4096, ge=16, description="longest sample with images and answer, tokens; longer samples are skipped"
     )
     dtype: Dtype = Field("auto", description="number type of the computation; auto: bfloat16 on cuda, float32 on a CPU")
-    random_student: RandomStudent = Field(RandomStudent(), description="size of the student of `--student random`")
 
     validation_samples: int = Field(64, ge=0, description="number of samples of val, chosen at random; 0: none")
     validate_every_steps: int = Field(0, ge=0, description="steps between validations; 0: at the end of each epoch")

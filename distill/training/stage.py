@@ -23,7 +23,7 @@ from distill.schema import Sample, decision_place, open_split, resolve_trees, tr
 from distill.student.chat import check_template
 from distill.student.features import PictureReader
 from distill.student.model import Student, is_hub_name, load_student, pick_device, require, student_path, weight_files
-from distill.student.random_student import RANDOM, TINY, TINY_STUDENT, make_random_student
+from distill.student.random_student import TINY, make_random_student
 from distill.student.saving import write_student
 from distill.training.checkpoints import learning_weights
 from distill.training.fit import LOG, fit, seeded
@@ -174,7 +174,7 @@ def run(
     """Read a training set, its playback trees and a student; write `adapter/` or `model/`, `log.jsonl`, `checkpoints/`.
 
     Args:
-        student: a folder, a GGUF file, the name of a repository, or `tiny` or `random`, which are made in `out`.
+        student: a folder, a GGUF file, the name of a repository, or `tiny`, which is made in `out`.
 
     Returns:
         The folder `adapter/`, which peft loads, or `model/`, which transformers loads.
@@ -192,22 +192,19 @@ def run(
     product = out / (ADAPTER if cfg.method == "lora" else MODEL)
     with torch_errors(cfg), processes(cfg, out) as accelerator:
         trees = resolve_trees(dataset, data)
-        random_student = {TINY: TINY_STUDENT, RANDOM: cfg.random_student}.get(str(student))
+        is_tiny = str(student) == TINY
         inputs = {"dataset": dataset, **tree_inputs(trees.values())}
-        if random_student is None:
-            base = student_path(str(student), allow_code=cfg.allow_code)
-            inputs |= weight_files(base)
-        else:
-            base, cfg = out / STUDENT, cfg.model_copy(update={"random_student": random_student})
+        base = out / STUDENT if is_tiny else student_path(str(student), allow_code=cfg.allow_code)
+        inputs |= {} if is_tiny else weight_files(base)
         folder: StageFolder | None = None
         if accelerator.is_main_process:  # its error ends all
             given: Any = {"config": cfg, "inputs": inputs, "seed": seed}
             folder = StageFolder.open(out, STAGE, **given, begun=(LOG, STUDENT))
-            if random_student and not folder.is_complete and not base.exists():
+            if is_tiny and not folder.is_complete and not base.exists():
                 samples = open_split(dataset, "train")
                 chosen = samples[:: max(1, len(samples) // TOKENIZER_SAMPLES)]
                 texts = (text for s in chosen for text in (s.prompt.system, s.prompt.user, s.answer))
-                make_random_student(base, random_student, seed, texts)
+                make_random_student(base, seed, texts)
         is_complete = folder is not None and folder.is_complete
         if broadcast_object_list([is_complete])[0]:  # all processes know what the main one knows
             return product
