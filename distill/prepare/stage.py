@@ -294,17 +294,17 @@ def _read_windows(tracks: _Tracks) -> tuple[dict[str, list[Sample]], Counter[str
 
 
 def _facts(samples: Mapping[Split, Sequence[Sample]]) -> dict[str, dict[str, Any]]:
-    """Return the counts of the manifest; warn of empty splits and of decisions that training does not have."""
+    """Return the counts of the manifest, and log them; warn of decisions that training does not have."""
     facts: dict[str, dict[str, Any]] = {}
     in_train = {sample.decision for sample in samples["train"]}
     for split, in_split in samples.items():
         decisions = dict(sorted(Counter(sample.decision for sample in in_split).items()))
-        if not in_split:
-            log.warning("%s: the split %s is empty", STAGE, split)
         if not_in_train := {name: count for name, count in decisions.items() if name not in in_train}:
             log.warning("%s: %s has decisions that train does not have: %s", STAGE, split, not_in_train)
         walks = {sample.walk for sample in in_split}
         tracks = {(sample.run, sample.town, sample.trajectory, sample.variant) for sample in in_split}
         counts = {"samples": len(in_split), "walks": len(walks), "tracks": len(tracks)}
+        words = "%s: %s (samples: %d, pedestrian trajectories: %d)"
+        log.log(logging.INFO if in_split else logging.WARNING, words, STAGE, split, len(in_split), len(walks))
         facts[split] = {**counts, "by_decision": decisions, "not_in_train": not_in_train}
     return facts
