@@ -135,8 +135,8 @@ def test_a_signal_ends_a_training_after_its_step_with_a_checkpoint(place, tmp_pa
     finally:
         signal.signal(signal.SIGTERM, before)
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["step_00000003"]
-    assert "no checkpoint yet" in caplog.text
-    assert "resumed after step 3" in caplog.text
+    assert "begins with step 1 of 6" in caplog.text
+    assert "resumes with step 4 of 6" in caplog.text
     assert not (tmp_path / "adapter").exists()
 
 
@@ -297,8 +297,11 @@ def test_samples_are_left_out_with_a_reason_and_counted(place, tmp_path, caplog)
     sized = good[3].model_copy(update={"sample_id": "sized", "picture_px": (32, 32)})
     splits = {"train": [*good, long, spoken, pictured, sized], "val": samples_of(place, "val")}
     dataset = write_set(tmp_path / "set", splits, [place / "tree"])
-    run(place, tmp_path / "out", dataset=dataset, max_steps=1)
+    run(place, tmp_path / "out", dataset=dataset, max_steps=1, samples_per_step=len(good) + 4)
     counts = json.loads((tmp_path / "out" / "manifest.json").read_text())["counts"]
     assert counts["dropped"] == {"special_token": 2, "too_long": 1, "unreadable_picture": 1}
     assert (counts["kept"], counts["input"]) == (len(good), len(good) + 4)
     assert "skipped as too_long; the first: long/" in caplog.text
+    run(place, tmp_path / "few", max_steps=2, samples_per_step=3)  # encodes no more than it needs
+    counts = json.loads((tmp_path / "few" / "manifest.json").read_text())["counts"]
+    assert (counts["kept"], counts["dropped"]) == (6, {"beyond_max_steps": len(good) - 6})

@@ -223,12 +223,6 @@ def _token_weights(text: str, tokens: Mapping[str, Any], decision_weight: float)
     return weights
 
 
-def special_token_in(processor: Processor, sample: Sample) -> str | None:
-    """Return a token of the chat that a text of the sample contains; None: there is none."""
-    texts = (sample.prompt.system, sample.prompt.user, sample.answer)
-    return next((t for t in processor.chat_tokens if any(t in text for text in texts)), None)
-
-
 def check_template(processor: Processor, sample: Sample) -> None:
     """Check that prompt, answer and end are, character by character, what the chat template writes for the chat."""
     written = processor.chat_text(sample)

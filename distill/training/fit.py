@@ -188,8 +188,6 @@ def fit(context: TrainingContext, out: Path) -> Progress:
     if progress.samples != used_digest:
         fix = "restore the pictures as they were, or choose another --out"
         raise ResumeError("the usable samples have changed since the training began", where=out, fix=fix)
-    words = f"resumed after step {progress.step}" if newest else "no checkpoint yet: begins with the first step"
-    log.info("%s: %s", STAGE, words)
     if accelerator.is_main_process:
         cut_log(out / LOG, progress.step if newest else -1)
     note = partial(_note, context, out / LOG)
@@ -212,6 +210,8 @@ def _take_steps(context: TrainingContext, optimizer: Any, progress: Progress, fo
     rank, num_ranks = accelerator.process_index, accelerator.num_processes
     num_steps, per_epoch = count_steps(cfg, len(lengths))
     first = progress.step
+    words = f"{'resumes' if first else 'begins'} with step %d of %d, each of %d samples; %d steps are one pass"
+    log.info(f"%s: {words}", STAGE, first + 1, num_steps, cfg.samples_per_step, per_epoch)
     start_s = time.monotonic()
     step_start_s = saved_s = start_s
     with progress_bar(STAGE, total=num_steps, done=first) as advance, first_signal() as received:

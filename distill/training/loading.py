@@ -16,7 +16,7 @@ from cosfly.runtime.errors import CosflyError
 from cosfly.runtime.limits import memory_bytes, num_cpus
 from cosfly.runtime.worker import LEFT_TO_THE_PARENT, end_with_parent
 from distill.schema import Sample
-from distill.student.chat import EncodedSample, Processor, special_token_in
+from distill.student.chat import EncodedSample, Processor
 from distill.student.features import FramePicture, PictureReader, Tensors, encode, pictures_of, read_features
 from distill.student.model import Student
 from distill.training.settings import STAGE, TrainConfig
@@ -102,22 +102,25 @@ class TrainingSplit:
     used: list[TrainingSample] = field(default_factory=list)  # by increasing index
     skipped: defaultdict[str, list[str]] = field(default_factory=lambda: defaultdict(list))  # reason -> messages
 
-    def encode(self, indices: Sequence[int], max_tokens: int, workers: int) -> None:
-        """Encode samples, and skip those that cannot be used."""
+    def encode(self, generator: np.random.Generator, most: int, max_tokens: int, workers: int) -> None:
+        """Encode at most so many samples, chosen at random, and skip those that cannot be used."""
         known: dict[FramePicture, FramePicture] = {}  # equal pictures become one object
+        indices = generator.permutation(len(self.samples)).tolist()
         encoded = in_order(partial(self._encode, max_tokens=max_tokens), indices, workers)
-        with progress_bar(f"{STAGE}: encoding texts", total=len(indices)) as advance:
-            for sample in encoded:
+        with progress_bar(f"{STAGE}: encoding texts", total=min(most, len(indices))) as advance:
+            while len(self.used) < most and (sample := next(encoded, None)):
                 if isinstance(sample, SkippedSample):
                     self.skipped[sample.reason].append(sample.message)
                 else:
                     pictures = tuple(known.setdefault(picture, picture) for picture in sample.pictures)
                     self.used.append(sample._replace(pictures=pictures))
                 advance(1)
+        self.used.sort(key=lambda sample: sample.sample_index)
 
     def _encode(self, index: int, max_tokens: int) -> TrainingSample | SkippedSample:
         sample = self.samples[index]
-        if token := special_token_in(self.processor, sample):
+        texts = (sample.prompt.system, sample.prompt.user, sample.answer)
+        if token := next((t for t in self.processor.chat_tokens if any(t in text for text in texts)), None):
             return SkippedSample("special_token", f"{sample.key}: a text contains {token}")
         row = self.processor.encode(sample, self.max_pixels, self.decision_weight)
         if len(row) > max_tokens:

@@ -214,6 +214,8 @@ def run(
         if folder is not None:
             num_used = len(context.train.used)
             skipped = Counter({reason: len(samples) for reason, samples in context.train.skipped.items()})
+            if num_left := len(context.train.samples) - num_used - skipped.total():
+                skipped["beyond_max_steps"] = num_left
             tally = Tally(input=num_used + skipped.total(), kept=num_used, dropped=skipped)
             if cfg.method == "full":
                 context.student.model.to(context.student.dtype)
@@ -246,10 +248,10 @@ def _context(
     check_head(student)
     chat_format = chat_format_of(samples, cfg.max_pixels)  # its errors come before the training
     train = TrainingSplit(samples, student, cfg.max_pixels, cfg.decision_weight)
-    train.encode(range(len(samples)), cfg.max_tokens, cfg.data_workers)
+    most = cfg.max_steps * cfg.samples_per_step or len(samples)
+    train.encode(rng_for(seed, STAGE, "train"), most, cfg.max_tokens, cfg.data_workers)
     val = TrainingSplit(validation, student, cfg.max_pixels, cfg.decision_weight)
-    order = rng_for(seed, STAGE, "validation").permutation(len(validation))
-    val.encode(sorted(order[: cfg.validation_samples].tolist()), cfg.max_tokens, cfg.data_workers)
+    val.encode(rng_for(seed, STAGE, "validation"), cfg.validation_samples, cfg.max_tokens, cfg.data_workers)
     reader = PictureReader(student, trees, cfg.max_pixels)
     context = TrainingContext(student, cfg, seed, accelerator, train, val, reader)
     context.read_pictures()
@@ -264,9 +266,9 @@ def _context(
 
 def _log_split(name: str, split: TrainingSplit) -> None:
     """Log how many samples are used, and warn of those that are skipped."""
-    words = "%s: %s has %d samples with %d tokens, %d of them in answers"
+    words = "%s: %s: %d of %d samples are used; they have %d tokens, %d of them in answers"
     num_answer = sum(len(sample.row.answer_ids) for sample in split.used)
-    log.info(words, STAGE, name, len(split.used), split.lengths.sum(), num_answer)
+    log.info(words, STAGE, name, len(split.used), len(split.samples), split.lengths.sum(), num_answer)
     for reason, skipped in sorted(split.skipped.items()):
         words = "%s: %d samples of %s are skipped as %s; the first: %s"
         log.warning(words, STAGE, len(skipped), name, reason, skipped[0])
