@@ -225,7 +225,7 @@ def test_a_student_can_answer_with_its_decision_alone(town, tmp_path, in_this_pr
         ['{"flight_decision": "move_forward', "{'flight_decision': \"Hover", '{"flight_decision": "up', "?"]
     )
 
-    def answers(student, rows, pictures, *, max_tokens, stop):
+    def answers(student, rows, pictures, *, max_tokens, stop, advance):
         assert stop == '",'
         return [Completion(next(texts), 9, True) for _ in rows]
 

@@ -42,14 +42,16 @@ class Completion(NamedTuple):
 
 
 def generate(
-    student: Student, rows: Sequence[EncodedSample], features: Sequence[Tensors], *, max_tokens: int, stop: str = ""
-) -> list[Completion]:
+    student: Student, rows: Sequence[EncodedSample], features: Sequence[Tensors], *,
+    max_tokens: int, stop: str = "", advance: Advance = lambda *_: None,
+) -> list[Completion]:  # fmt: skip
     """Answer a batch of prompts greedily, in their order; the answers in `rows` are not used.
 
     Args:
         features: of the pictures of all rows, row after row.
         max_tokens: longest answer, the end token included.
         stop: an answer ends before this text as well.
+        advance: gets words about each step.
     """
     import torch
     from transformers import GenerationConfig
@@ -64,10 +66,15 @@ def generate(
         cache_implementation="static" if is_one_type else "dynamic",
         disable_compile=True,  # a compiled step holds for one batch size and length, and costs a minute
     )  # fmt: skip
+
+    def show(tokens: torch.Tensor, *_: object, **__: object) -> bool:
+        advance(0, f"the next {len(rows)} answers have {tokens.shape[1] - num_prompt} of at most {max_tokens} tokens")
+        return False  # does not end the answers
+
     core.generation_config = config  # settings for sampling of the model folder would complete those of `config`
     student.model.eval()
     with torch.inference_mode(), student.computing(), with_encoded_pictures(student, features) as picture_inputs:
-        sequences = core.generate(**inputs, **picture_inputs, tokenizer=student.tokenizer)
+        sequences = core.generate(**inputs, **picture_inputs, tokenizer=student.tokenizer, stopping_criteria=[show])
     completions = []
     for tokens in sequences[:, num_prompt:].tolist():
         written = tokens[: tokens.index(end)] if end in tokens else [token for token in tokens if token != pad]
@@ -105,10 +112,10 @@ class LocalAnswers:
         self._reader = PictureReader(self.student, inputs.trees, self.max_pixels)
 
     async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[SampleOutcome, None]:
-        """Yield the outcome of each sample, in their order; `advance` is called after each batch."""
+        """Yield the outcome of each sample, in their order; `advance` is called after each token and batch."""
         if not self.student.has_pictures:
             samples = (sample.without_pictures() for sample in samples)
-        rest = iter(samples)
+        self._advance, rest = advance, iter(samples)
         while batch := list(islice(rest, self.batch_size)):
             recorded = [self.book.get(flight_of(sample.sample_id), self._key(sample)) for sample in batch]
             # Without one of the answers the whole batch is answered again: rounding may depend on what is in it.
@@ -162,7 +169,9 @@ class LocalAnswers:
 
         all_features = [tensors for of_row in features for tensors in of_row]
         try:
-            return generate(self.student, rows, all_features, max_tokens=self.max_tokens, stop=self._stop)
+            return generate(
+                self.student, rows, all_features, max_tokens=self.max_tokens, stop=self._stop, advance=self._advance
+            )
         except torch.OutOfMemoryError as error:
             if len(rows) == 1:
                 where, fix = f"{STAGE}.max_pixels", "lower max_pixels or max_new_tokens, and choose another --out"

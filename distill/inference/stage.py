@@ -7,6 +7,7 @@ as teachers are, with the prompts and pictures of the training.
 import asyncio
 import contextlib
 import logging
+import signal
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -22,6 +23,7 @@ from cosfly.runtime.errors import ConfigError, InputError, TeacherError, counts_
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.run_dir import Failed, StageFolder, Tally, read_manifest, read_stage_record, write_failures
+from cosfly.runtime.seeding import random_bytes
 from distill.inference.answers import EngineAnswers, LocalAnswers
 from distill.inference.samples import STAGE, InferConfig, Inputs, SampleOutcome
 from distill.schema import open_split, resolve_trees, tree_inputs
@@ -91,10 +93,15 @@ def run(
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=files, seed=0)
     if stage.is_complete:
         return out / PREDICTIONS
-    samples = open_split(dataset, cfg.split)[: cfg.max_samples or None]
-    if not samples:
+    in_split = open_split(dataset, cfg.split)
+    if not in_split:
         fix = "set distill.infer.split to another split, or prepare more pedestrian trajectories"
         raise InputError("the split is empty", where=dataset, got=f"the split `{cfg.split}`", fix=fix)
+    # By the hash of a window, so that its languages are chosen together.
+    ranked = sorted(in_split, key=lambda sample: random_bytes(0, STAGE, sample.sample_id))
+    chosen = {sample.key for sample in ranked[: cfg.max_samples or None]}
+    samples = [sample for sample in in_split if sample.key in chosen]
+    log.info("%s: %d of %d samples of the split %s", STAGE, len(samples), len(in_split), cfg.split)
     inputs = Inputs(samples, trees, model, adapter)
     start_s = time.monotonic()
     name = str(cfg.endpoint.model) if cfg.engine == "endpoint" else inputs.name
@@ -125,6 +132,8 @@ async def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path) -> tuple[list
         advance = stack.enter_context(progress_bar(STAGE, total=len(inputs.samples)))
         answering: LocalAnswers | EngineAnswers
         if cfg.engine == "transformers":
+            with contextlib.suppress(ValueError):  # not in the main thread, which gets no Ctrl-C
+                signal.signal(signal.SIGINT, signal.default_int_handler)  # asyncio's waits for the end of a batch
             answering = LocalAnswers(cfg, inputs, book)
         else:
             engine: Engine
