@@ -7,6 +7,7 @@ from typing import Any
 from cosfly.formats.captions import FIELDS, TOKENS, Coc, Language
 from cosfly.formats.episodes import Figure
 from cosfly.formats.predictions import Prediction, Split
+from cosfly.inspection.blind_baseline import LEAST_WINDOWS
 from cosfly.runtime.json_io import FileFormat, Record, read_model
 from cosfly.viz.page import page
 from cosfly.viz.tables import TextTable
@@ -45,7 +46,8 @@ NOTES = [
     "Verdicts and the label come from the motion after the window, by the same rules as for captions.",
     "The majority gives one answer of the training split to every sample. The rule is a decision tree of depth two, "
     "and blind a small network, on the poses and positions of the last frames as they were drawn, which the prompt "
-    "describes; both are fitted on the decisions of the training split and see no picture.",
+    "describes; both are fitted on the decisions of the training split and see no picture. "
+    f"The network needs {LEAST_WINDOWS} training samples.",
     "The paper's columns were measured on 10,000 samples of its own data, with layer 17 of roberta-large and another "
     "teacher, so only the distance to the baselines can be compared.",
 ]
@@ -155,6 +157,8 @@ def summary_tables(product: Path) -> Iterator[TextTable]:
         rows = [[name, *(_shown(key, own.figures[key]) for key in SUMMARY)] for name, own in part.who.items()]
         counts = f"samples: {part.samples}, pedestrian trajectories: {part.walks}"
         counts += f", decisions of the teacher: {len(part.who[TEACHER].by_decision)}"
+        if "blind" not in part.who:
+            counts += f", no blind network: it needs {LEAST_WINDOWS} training samples"
         title = f"{LANGUAGES[language]} ({counts}); all figures are in evaluation.html"
         yield TextTable(title, ["", *(FIGURES[key] for key in SUMMARY)], rows)
 

@@ -261,12 +261,8 @@ def floors_of(
     Without a training sample in `language` there are no baselines; without the geometry of the past there is no rule
     and no network. A hash of each sample chooses the majority's text and the samples to fit to.
     """
-    ranks = {
-        sample.key: hashlib.sha256(f"{seed}/distill.floor/{sample.sample_id}".encode()).digest()
-        for sample in train
-        if sample.language == language
-    }
     in_language = [sample for sample in train if sample.language == language]
+    ranks = {s.key: hashlib.sha256(f"{seed}/distill.floor/{s.sample_id}".encode()).digest() for s in in_language}
     answers = {TEACHER: Answers.of(np.array([decision_number(s.decision, s.key) for s in samples]))}
     decision = majority(sample.decision for sample in in_language)
     if decision is not None:
