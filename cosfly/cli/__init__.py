@@ -78,6 +78,8 @@ def _end(status: int | str | None) -> None:
     Threads of libraries abort the interpreter's shutdown now and then (2 in about 200), which a launcher would take
     for a failure of the whole training.
     """
+    for number in (signal.SIGINT, signal.SIGTERM):  # a second Ctrl-C during the shutdown would print a traceback
+        signal.signal(number, signal.SIG_DFL)
     for stream in (sys.stdout, sys.stderr):
         if stream is not None:  # a process may be started with a stream closed
             stream.flush()

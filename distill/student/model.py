@@ -42,9 +42,11 @@ def require(*packages: str) -> None:
 def quiet_transformers() -> None:
     """Turn off the library's progress bars and hints, which would mix with ours."""
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"transformers\.")
+    from transformers import modeling_gguf_pytorch_utils
     from transformers.utils import logging as transformers_logging
 
     transformers_logging.disable_progress_bar()
+    modeling_gguf_pytorch_utils.tqdm = transformers_logging.tqdm  # its own bar does not follow the line above
     transformers_logging.set_verbosity_error()
 
 
