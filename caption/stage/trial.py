@@ -9,6 +9,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.students import student_settings
 from caption.teachers.teacher import EMBEDDED, AskingTeacher, open_teacher
 from cosfly.formats.captions import FIELDS, Caption
-from cosfly.llm.answers import AnswerBook, Budget
+from cosfly.llm.answers import AnswerBook, Budget, KeptAnswers
 from cosfly.llm.contract import NoAnswer, Reply, Request, run_until_interrupted
 from cosfly.runtime.console import Advance, duration, progress_bar
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError, TeacherError
@@ -33,8 +34,30 @@ log = logging.getLogger(__name__)
 
 # Reasons why an answer has no JSON object, in words.
 STRUCTURES = {"no_json_object": "no JSON object", "cut_short": "cut at caption.endpoint.max_tokens"}
-WAITING = "waiting for the next one"
-MOST_LOGGED = 200  # characters of an answer that are logged when it arrives
+KINDS = {"free": "English", "mirror": "Chinese"}  # of requests, by the first word of their purpose
+MOST_LOGGED = 200  # characters of a request or an answer
+
+
+@dataclass
+class _LoggedAnswers(KeptAnswers):
+    """Answers of which each request and answer is logged and kept by window."""
+
+    exchanges: dict[str, list[tuple[Request, Reply]]] = field(default_factory=dict)
+    advance: Advance = lambda *_: None
+
+    async def ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:
+        number, kind = len(self.exchanges[sample_id]) + 1, purpose.partition("/")[0]
+        words = KINDS.get(kind, kind)
+        if "/correction" in purpose:
+            words += ", again: " + for_terminal(request.messages[-1]["content"][-1]["text"], MOST_LOGGED)
+        log.info("%s: request %d, %s", sample_id, number, words)
+        self.advance(0, f"waiting for answer {number}")
+        reply = await super().ask(request, track, sample_id, purpose)
+        self.exchanges[sample_id].append((request, reply))
+        text = for_terminal(reply.text, MOST_LOGGED)
+        log.info("%s: answer %d%s: %s", sample_id, number, _problem_of(reply), text)
+        self.advance(1)
+        return reply
 
 
 def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *, seed: int = 0) -> Iterator[str]:
@@ -59,23 +82,16 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
     start_s = time.monotonic()
 
     async def ask(advance: Advance) -> list[Caption | BaseException]:
-        def record(sample_id: str, request: Request, reply: Reply) -> None:
-            exchanges[sample_id].append((request, reply))
-            number, problem = len(exchanges[sample_id]), _problem_of(reply)
-            log.info("%s: answer %d%s: %s", sample_id, number, problem, for_terminal(reply.text, MOST_LOGGED))
-            advance(1, WAITING)
-
         with AnswerBook(out / ANSWERS) as book:
             budget = Budget(cfg.budget, cfg.most_in_flight, book.totals)
             async with open_teacher(cfg, book, seed, budget) as teacher:
                 assert isinstance(teacher, AskingTeacher)
-                teacher.kept.listener = record
+                teacher.kept = _LoggedAnswers(teacher.kept.engine, book, budget, exchanges=exchanges, advance=advance)
                 asked = [caption_window(window, teacher, cfg, vocabulary) for window in windows]
                 return await asyncio.gather(*asked, return_exceptions=True)
 
     log.info("a window takes 2 answers, up to %d if some are refused, and more if a decision is in conflict", MOST_ASKS)
     with progress_bar("answers", None) as advance:
-        advance(0, WAITING)
         outcomes = run_until_interrupted(ask(advance))
     seconds = time.monotonic() - start_s
     for outcome in outcomes:

@@ -13,7 +13,7 @@ import logging
 import re
 import time
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -236,8 +236,6 @@ class KeptAnswers:
     book: AnswerBook | None  # None records nothing
     budget: Budget | None = None  # None sets no limit
     retried: frozenset[str] = frozenset()  # samples to ask again if the recorded answer filled the context or declined
-    # Called with each sample id, request and reply.
-    listener: Callable[[str, Request, Reply], None] = lambda sample_id, request, reply: None
     _asking: WeakValueDictionary[str, asyncio.Lock] = field(default_factory=WeakValueDictionary)  # by key
 
     async def ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:
@@ -248,11 +246,8 @@ class KeptAnswers:
             recorded = None if self.book is None else self.book.get(track, key)
             is_retried = sample_id in self.retried  # the context may be larger now
             if recorded is not None and not (is_retried and recorded.finish_reason in (CONTEXT_FULL, DECLINED)):
-                reply = recorded.reply
-            else:
-                reply = await self._ask_engine(request, track, key, sample_id, purpose)
-        self.listener(sample_id, request, reply)
-        return reply
+                return recorded.reply
+            return await self._ask_engine(request, track, key, sample_id, purpose)
 
     async def _ask_engine(self, request: Request, track: str, key: str, sample_id: str, purpose: str) -> Reply:
         """Ask the engine within the budget, and record its answer before anything is derived from it."""
