@@ -174,4 +174,7 @@ def leaderboard(
     """Compare students: figures with intervals, floors and a ceiling."""
     parts = (text.partition("=") for text in folders)
     named = [(name, Path(folder)) if equals else ("", Path(name)) for name, equals, folder in parts]
-    job.run("cosfly.closed_loop.leaderboard", named, out)
+    product = job.call("cosfly.closed_loop.leaderboard", named, out)
+    for table in job.call("cosfly.closed_loop.leaderboard:summary_tables", product):
+        options.print_table(table.columns, table.rows, table.title)
+    job.finish(product, out)

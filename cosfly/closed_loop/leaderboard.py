@@ -3,7 +3,7 @@
 A table contains only students with the same episodes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -13,12 +13,14 @@ from cosfly.formats.episodes import Figure, Score, read_score
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import write_bytes
-from cosfly.runtime.json_io import FileFormat, Record, write_model
+from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 from cosfly.runtime.run_dir import StageFolder, Tally
 from cosfly.viz.page import page
+from cosfly.viz.tables import TextTable
 
 Role = Literal["student", "floor", "ceiling"]
 RANKED_BY = ("success", "in_view")
+SUMMARY = {"success": "success", "in_view": "target visible", "crashed": "crashed"}  # in the terminal
 HEADLINE = ("success", "in_view", "tracked_frames", "kept_s", "lost", "crashed")
 BOARD_FORMAT = FileFormat("cosfly.leaderboard", "3.0", "leaderboard")
 
@@ -79,6 +81,18 @@ def tables_of(students: Sequence[tuple[str, Score]]) -> list[StudentTable]:
     for group in groups.values():
         group.sort(key=lambda row: [row.score.figures[name].value or 0.0 for name in RANKED_BY], reverse=True)
     return [StudentTable(episodes_sha256=digest, standings=tuple(group)) for digest, group in groups.items()]
+
+
+def summary_tables(page_path: Path) -> Iterator[TextTable]:
+    """Yield the most important figures of a leaderboard, one table for each list of episodes."""
+    board = read_model(page_path.with_suffix(".json"), Leaderboard, BOARD_FORMAT)
+    for table in board.tables:
+        rows = []
+        for one in table.standings:
+            most = one.score.most_decisions
+            shortened = f" (at most {most} decisions)" if most else ""
+            rows.append([one.name + shortened, *(_shown(name, one.score.figures[name]) for name in SUMMARY)])
+        yield TextTable(f"{len(table.standings[0].score.flights)} episodes", ["", *SUMMARY.values()], rows)
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, NonNegativeInt, model_validator
 
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
 EPISODES = "episodes"  # folder of the records
@@ -160,4 +161,7 @@ class Score(Record):
 
 def read_score(folder: Path) -> Score:
     """Read the score in an output directory of `cosfly fly`; raises as `read_model`."""
+    if not (folder / SCORE).exists():
+        expected = f"an output directory of `cosfly fly`, with {SCORE}"
+        raise InputError("there is no score", where=folder, expected=expected, fix="run cosfly fly --out DIR first")
     return read_model(folder / SCORE, Score, SCORE_FORMAT, tree=folder)
