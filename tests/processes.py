@@ -1,13 +1,26 @@
 """Processes that a test starts: waiting for what they do, and seeing that they are gone."""
 
+import resource
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from cosfly.runtime.pool import Watch
 
 # A stopped worker is lost after 4 s, long before its item has taken too long: a busy machine does not exchange the two.
 QUICK = Watch(item_limit_s=6.0, heartbeat_s=0.1, check_s=0.4, probe_s=0.3, failed_checks=10)
+
+
+@contextmanager
+def full_disk(num_bytes: int) -> Iterator[None]:
+    """Limit the size of files: the system cuts the write that exceeds it, as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def wait_until(holds: Callable[[], object], patience_s: float = 60.0) -> None:

@@ -13,7 +13,9 @@ from caption.schema import CaptionConfig
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.rules import write_templates
 from caption.verification.facts import Facts
-from cosfly.formats.captions import Coc
+from caption.verification.values import check_values
+from cosfly.formats.captions import Coc, Language
+from cosfly.llm.answer_text import sentences_of
 
 VOCABULARY = vocabulary_of(CaptionConfig())  # what ships
 SLOTS = FORMATS["slots"]
@@ -61,6 +63,10 @@ def write_answers(facts: Facts, rng: np.random.Generator, decision: str | None =
     second = SLOTS.read_mirror(chinese, first, facts, True)
     assert isinstance(second, Draft), second
     return first.coc, second.coc
+
+
+def contradictions_of(coc: Coc, facts: Facts, language: Language) -> list[str]:
+    return list(check_values(sentences_of(coc), facts, language).contradictions)
 
 
 QUICK = {"max_tries": 2, "timeout_s": 60.0, "concurrency": 4}

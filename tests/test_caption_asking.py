@@ -10,7 +10,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from processes import wait_until
+from processes import full_disk, wait_until
 from specimens_captions import deciding, report_of, settings
 from teacher_server import is_mirror, kept_answers
 
@@ -30,20 +30,6 @@ def keys_by_flight(out: Path) -> dict[str, list[str]]:
     for kept in kept_answers(out):
         found.setdefault(kept["sample_id"].partition("_frame_")[0], []).append(kept["key"])
     return found
-
-
-LIMITED = """
-import json, resource, sys
-from pathlib import Path
-from caption.schema import CaptionConfig
-from caption.stage.stage import run
-from cosfly.runtime.errors import StorageError
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)
-try:
-    run(CaptionConfig.model_validate(json.loads(sys.argv[4])), Path(sys.argv[2]), Path(sys.argv[3]))
-except StorageError as error:
-    print(error, file=sys.stderr)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -152,17 +138,11 @@ def test_the_total_timeout_bounds_all_tries(tree, tmp_path, monkeypatch):
 
 
 def test_a_disk_that_fills_up_costs_nothing_that_was_written(tree, tmp_path, whole):
-    """The limit on a file's size stands for the disk: the system cuts the line that passes it short, as a full disk
-    does."""
     out = tmp_path / "out"
     with deciding() as server:
         config = settings(server.url)
-        filled = subprocess.run(
-            [sys.executable, "-c", LIMITED, "9000", str(tree), str(out), config.model_dump_json()],
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        assert "cannot be written" in filled.stderr, filled.stderr
-        assert "finished work is kept" in filled.stderr
+        with full_disk(9_000), pytest.raises(StorageError, match=r"cannot be written.*finished work is kept"):
+            run(config, tree, out)
         assert not (out / "manifest.json").exists()
         kept = keys_by_flight(out)
         assert run(config, tree, out).read_bytes() == whole
