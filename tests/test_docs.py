@@ -228,7 +228,7 @@ def typed_commands(page: Path) -> list[str]:
 
 
 COMMAND_LINE = typer.main.get_command(app)
-# The commands of extending.md need its examples: tests/test_docs_examples.py runs them.
+# The commands of extending.md need its examples: tests/test_docs_run.py runs them.
 ALL = [(page.name, text) for page in PAGES if page.name != "extending.md" for text in typed_commands(page)]
 
 
