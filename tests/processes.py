@@ -1,10 +1,12 @@
 """Processes that a test starts: waiting for what they do, and seeing that they are gone."""
 
 import resource
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from cosfly.runtime.pool import Watch
 
@@ -28,6 +30,13 @@ def wait_until(holds: Callable[[], object], patience_s: float = 60.0) -> None:
     while not holds():
         assert time.monotonic() < until_s, "it never came to that"
         time.sleep(0.02)
+
+
+def ran(*words: object, **how: Any) -> subprocess.CompletedProcess[str]:
+    """Run a program that has to succeed."""
+    done = subprocess.run([*map(str, words)], capture_output=True, text=True, check=False, **how)
+    assert done.returncode == 0, f"{done.stdout[-3000:]}{done.stderr[-3000:]}"
+    return done
 
 
 def is_running(pid: int) -> bool:

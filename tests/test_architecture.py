@@ -4,13 +4,13 @@ import ast
 import os
 import re
 import shlex
-import subprocess
 import sys
 import tomllib
 from functools import cache
 from pathlib import Path
 
 import pytest
+from processes import ran
 from test_docs import parsed
 
 from cosfly.runtime import limits
@@ -188,8 +188,7 @@ def test_help_is_instant():
     one on modules not."""
     program = "import sys; sys.argv = ['cosfly', '--help']; from cosfly.cli import main\ntry: main()\n"
     program += "except SystemExit: pass\nimport time; print('LOADED', time.process_time(), *sorted(sys.modules))"
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    cpu_s, *loaded = result.stdout.split("LOADED")[1].split()
+    cpu_s, *loaded = ran(sys.executable, "-c", program).stdout.split("LOADED")[1].split()
     assert float(cpu_s) < 5
     assert not set(loaded) & {"numpy", "numba", "cv2", "pydantic", "torch", "scipy", "pyarrow", "moderngl"}
 
@@ -250,8 +249,8 @@ def commands_of(tmp_path: Path, arguments: list[str], job: dict[str, str]) -> li
         (tmp_path / name).write_text(f"#!/bin/bash\n{text}\n")
         (tmp_path / name).chmod(0o755)
     environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "COSFLY": "echo cosfly"} | job
-    found = subprocess.run(["bash", SCRIPT, *arguments], env=environment, capture_output=True, text=True, check=True)
-    return [shlex.split(line)[1:] for line in found.stdout.splitlines() if line.startswith("cosfly ")]
+    told = ran("bash", SCRIPT, *arguments, env=environment).stdout
+    return [shlex.split(line)[1:] for line in told.splitlines() if line.startswith("cosfly ")]
 
 
 RUN = ["diverse", "shared/run"]

@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from commands import invoke
 from gymnasium.utils.env_checker import check_env
+from processes import ran
 
 import cosfly.envs
 from cosfly.closed_loop.policy import Policy
@@ -169,11 +169,7 @@ def test_wrappers_and_trainers_of_others_run_unmodified(name, tmp_path):
     if name == "stable_baselines3":
         pytest.importorskip(name)
     path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-    done = subprocess.run(
-        [sys.executable, "-c", TRAINERS[name]], cwd=tmp_path, capture_output=True, text=True, check=False,
-        env=os.environ | {"PYTHONPATH": path},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-3000:]
+    ran(sys.executable, "-c", TRAINERS[name], cwd=tmp_path, env=os.environ | {"PYTHONPATH": path})
 
 
 @pytest.mark.slow

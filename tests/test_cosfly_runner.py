@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from processes import QUICK, children_of, is_running, wait_until
+from processes import QUICK, children_of, is_running, ran, wait_until
 from toy_workers import items_of, make_faulty, stage_in
 
 import cosfly
@@ -335,9 +335,6 @@ def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
             f"from cosfly.runtime.compiled import njit\n\n\n@njit(cache=True)\ndef f(x):\n    return {factor} * x\n"
         )
         code = "from cosfly.upper import g; print(g(7), sum(g.stats.cache_hits.values()))"
-        done = subprocess.run(
-            [sys.executable, "-c", code], env=env, cwd=tmp_path, capture_output=True, text=True, check=True
-        )
-        printed.append(done.stdout.split())
+        printed.append(ran(sys.executable, "-c", code, env=env, cwd=tmp_path).stdout.split())
     assert printed == [["14", "0"], ["21", "0"], ["14", "1"]]  # what was compiled for the first sources is still there
     assert len(list((tmp_path / "cache" / "cosfly").iterdir())) == 2

@@ -2,7 +2,6 @@
 
 import re
 import shlex
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -12,6 +11,7 @@ from typing import Any
 import pytest
 import typer
 import yaml
+from processes import ran
 from pydantic import BaseModel
 
 import cosfly
@@ -124,13 +124,8 @@ def test_every_file_of_the_files_page_is_written_by_code():
 
 def test_the_site_is_built_without_a_warning(tmp_path):
     pytest.importorskip("mkdocs")
-    words = [
-        sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-f", str(ROOT / "mkdocs.yml"), "-d",
-        str(tmp_path / "site"),
-    ]  # fmt: skip
-    done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+    words = f"-m mkdocs build --strict -q -f {ROOT / 'mkdocs.yml'} -d {tmp_path / 'site'}"
+    assert ran(sys.executable, *words.split(), cwd=tmp_path).stderr == ""
     assert {f"{page.stem}.html" for page in (ROOT / "docs").rglob("*.md")} <= {
         p.name for p in (tmp_path / "site").rglob("*.html")
     }
@@ -188,9 +183,7 @@ def test_one_version_is_named_everywhere_and_every_tag_has_its_heading():
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))["version"]
     assert found[0][0] == cosfly.__version__ == pyproject == citation
-    tags = subprocess.run(
-        ["git", "tag", "--list", "v*"], cwd=ROOT, capture_output=True, text=True, check=False
-    ).stdout.split()
+    tags = ran("git", "tag", "--list", "v*", cwd=ROOT).stdout.split()
     assert set(tags) <= {f"v{number}" for number, day in found if day != "unreleased"}
 
 

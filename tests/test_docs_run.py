@@ -10,7 +10,6 @@ import os
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -20,6 +19,7 @@ from typing import Any
 
 import pytest
 import yaml
+from processes import ran
 from simulator_serving import serving
 from specimens_foreign import write_foreign_tree
 from specimens_slopes import sloped_city
@@ -353,10 +353,7 @@ def test_the_examples_work(clone):
         (clone / "bin" / name).chmod(0o755)
     environment = os.environ | {"PATH": f"{clone}/bin:{os.environ['PATH']}", "PYTHONPATH": str(clone)}
     for block in examples("bash"):
-        done = subprocess.run(
-            ["bash", "-e", "-c", block], cwd=clone, env=environment, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, f"{block}\n{done.stderr[-3000:]}"
+        ran("bash", "-e", "-c", block, cwd=clone, env=environment)
     assert [name for name in PRODUCTS if not (clone / name).is_file()] == []
 
 
@@ -373,6 +370,5 @@ def test_the_cells_of_the_notebook_run(tmp_path):
     write_quickstart(tmp_path)
     program = "\n\n".join(["import matplotlib", 'matplotlib.use("Agg")', *("".join(cell["source"]) for cell in CELLS)])
     for words in (["-m", "cosfly", "run", "quickstart", "--out", "runs/quickstart"], ["-c", program]):
-        done = subprocess.run([sys.executable, *words], cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr[-3000:]
+        done = ran(sys.executable, *words, cwd=tmp_path)
     assert re.search(r"^10 steps, loss \d", done.stdout, re.MULTILINE)

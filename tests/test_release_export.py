@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from filelock import FileLock
+from processes import ran
 from public_reader import read_public
 from release_tampering import rewrite
 from specimens_release import all_bytes, make_release, rows_by_id
@@ -277,11 +278,7 @@ def sha256(array: np.ndarray) -> str:
 def look(product: Path, home: Path, *indices: int) -> dict:
     """Return what LeRobot itself sees."""
     reader = Path(__file__).with_name("read_lerobot.py")
-    done = subprocess.run(
-        [str(lerobot_python()), str(reader), str(product), *map(str, indices)],
-        capture_output=True, text=True, check=False, env={"HF_HOME": str(home), "PATH": "/usr/bin:/bin"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-3000:]
+    done = ran(lerobot_python(), reader, product, *indices, env={"HF_HOME": str(home), "PATH": "/usr/bin:/bin"})
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("LOOK ")]
     return json.loads(line.removeprefix("LOOK "))
 
@@ -290,11 +287,9 @@ def look(product: Path, home: Path, *indices: int) -> dict:
 def test_lerobot_has_our_constants_and_reads_pictures_and_videos(dataset, tmp_path, video):
     """PyAV is in its environment."""
     script = "from cosfly.__main__ import main; main()"
-    options = ["--format", "lerobot", "--out", str(tmp_path / "out"), *(["--video"] if video else [])]
-    command = [str(lerobot_python()), "-c", script, "release", "export", str(dataset), *options]
+    options = ["--format", "lerobot", "--out", tmp_path / "out", *(["--video"] if video else [])]
     root = Path(__file__).parents[1]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
-    assert done.returncode == 0, done.stderr[-3000:]
+    ran(lerobot_python(), "-c", script, "release", "export", dataset, *options, cwd=root)
     seen = look(tmp_path / "out/lerobot", tmp_path / "hf")
     assert seen.pop("picture") == [3, 54, 96]
     assert seen == {

@@ -5,8 +5,9 @@ What is still to be rewritten is listed as an exception.
 
 import ast
 import re
-import subprocess
 from pathlib import Path
+
+from processes import ran
 
 ROOT = Path(__file__).resolve().parents[1]
 USER_WORDS = "cosfly/worldgen/words.yaml"  # the words of prompts
@@ -43,9 +44,7 @@ BANNED = re.compile(
 
 
 def files(*endings: str) -> list[str]:
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split(
-        "\n"
-    )
+    listed = ran("git", "ls-files", cwd=ROOT).stdout.splitlines()
     return [name for name in listed if name.endswith(endings) and not name.startswith(TO_REWRITE)]
 
 

@@ -9,14 +9,12 @@ Shares are in percent. The target counts as visible where a ray of five reaches 
 """
 
 import argparse
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import scenes  # noqa: F401  # finds the specimens
 
 from caption.schema import WindowConfig
 from caption.stage.windows import cut_windows, order_comes_within

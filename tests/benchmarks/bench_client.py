@@ -9,7 +9,6 @@ import asyncio
 import json
 import multiprocessing
 import shutil
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -17,9 +16,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+import scenes  # noqa: F401  # finds the specimens
 from specimens_captions import VOCABULARY
 from teacher_server import CHINESE, ENGLISH, kept_answers
 

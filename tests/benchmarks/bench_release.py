@@ -14,7 +14,6 @@ import hashlib
 import os
 import resource
 import shutil
-import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -22,9 +21,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+import scenes  # noqa: F401  # finds the specimens
 from specimens_distill import make_captions
 
 from cosfly.formats.frames import FILE_NAMES, FrameFile, depth_bytes, frame_name, instance_bytes, rgb_bytes
