@@ -1,4 +1,7 @@
-"""The documents are true: every command has help and stands in the README, and what they name exists."""
+"""The documents are true: every command has help and stands in the README, and what they name exists.
+
+Banned words stay out of code, messages and documents.
+"""
 
 import re
 import shlex
@@ -249,3 +252,23 @@ def test_no_option_in_running_text_is_unknown():
             known = {option for parameter in command.params for option in parameter.opts} | {"--help", "--version"}
             unknown += [f"{page.name}: cosfly {text}" for word in words if word.startswith("-") and word not in known]
     assert not unknown
+
+
+USER_WORDS = "cosfly/worldgen/words.yaml"  # the words of prompts
+BANNED = re.compile(
+    r"\b(anew|beside|whither|mend(s|ed|ing)?|look-alikes?|sign of life|of before|gone on with|taken up|left out|"
+    r"that which|is told|are told|was told|is borne out|are borne out|stands? in for|who answers|what is said)\b",
+    re.IGNORECASE,
+)
+
+
+def test_banned_words_are_not_used():
+    wrong = [
+        f"{name}:{number}: {match[0]}"
+        for name in ran("git", "ls-files", cwd=ROOT).stdout.splitlines()
+        if name.endswith((".py", ".md", ".html", ".js", ".yaml", ".css", "Makefile"))
+        if name != USER_WORDS and not name.startswith("tests/")
+        for number, line in enumerate((ROOT / name).read_text(encoding="utf-8").splitlines(), 1)
+        for match in BANNED.finditer(line)
+    ]
+    assert wrong == []
