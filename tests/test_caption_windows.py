@@ -15,12 +15,11 @@ from caption.stage.windows import current_frames, cut_future, cut_windows, recor
 from caption.teachers.prompts import make_question
 from caption.verification.actions import TABLE, measure
 from caption.verification.facts import measure_facts
-from cosfly.formats.boxes import MapHeader, make_box_map
-from cosfly.formats.playback import Perturbation, Track
+from cosfly.formats.playback import Track
 from cosfly.formats.playback_file import read_track, write_track
 from cosfly.formats.segments import Mission
 from cosfly.formats.tracks import find_tracks, read_twin
-from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, perturb
+from cosfly.geometry.axes import look_at
 from specimens import make_flight, make_playback_tree
 
 NO_IMAGES = WindowConfig(require_images=False)
@@ -133,27 +132,15 @@ NUM_POINTS = 160
 
 @pytest.fixture(scope="module")
 def two_tracks(tmp_path_factory):
-    """A clean flight and what the renderer's own perturbation makes of it, on disk; the person is hidden at other
-    times."""
-    clean, scene = make_flight(NUM_POINTS, seed=5)
-    boxes = make_box_map(
-        scene.centers, scene.half_extents, np.zeros_like(scene.centers), scene.kinds, scene.ids,
-        MapHeader(ground_z_m=0.0),
-    )  # fmt: skip
-    planned = Poses(clean.positions_m, clean.rotations_deg, clean.targets_m, np.full(NUM_POINTS, 5.0))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PerturbationConfig, "frame_margin", 0.0)
-        shaken = perturb(
-            planned, [clean.camera] * len(clean), Surroundings(boxes), PerturbationConfig(), np.random.default_rng(3)
-        )
-    hidden = np.zeros(NUM_POINTS, dtype=bool)
-    hidden[60:66] = True
+    """A clean flight and its perturbed twin, whose target is shifted too, on disk; the person is hidden at other times."""
+    clean, perturbed = (make_flight(NUM_POINTS, seed=5, variant=variant)[0] for variant in ("ORI", "aug_001"))
+    shifts_m = np.random.default_rng(3).uniform(-1.5, 1.5, (NUM_POINTS, 3))
+    before, after = (look_at(perturbed.positions_m, perturbed.targets_m + at) for at in (0.0, shifts_m))
+    aimed_deg = perturbed.rotations_deg + np.degrees([*np.subtract(after, before), np.zeros(NUM_POINTS)]).T
+    hidden = np.isin(np.arange(NUM_POINTS), range(60, 66))
     perturbed = dataclasses.replace(
-        clean, variant="aug_001", is_original=False, positions_m=shaken.poses.positions_m,
-        rotations_deg=shaken.poses.rotations_deg, targets_m=shaken.poses.targets_m,
-        perturbation=Perturbation(
-            shaken.is_perturbed, shaken.drone_offsets_m, shaken.rotation_offsets_deg, shaken.target_offsets_m
-        ),
+        perturbed, targets_m=perturbed.targets_m + shifts_m, rotations_deg=aimed_deg,
+        perturbation=dataclasses.replace(perturbed.perturbation, target_m=shifts_m),
         target=dataclasses.replace(clean.target, visible=clean.target.visible & ~hidden),
     )  # fmt: skip
     root = tmp_path_factory.mktemp("two")

@@ -247,66 +247,47 @@ CHILD = """
 import asyncio, sys, time
 from cosfly.llm.contract import run_until_interrupted
 
-def report_no_slow_steps():  # as development mode would on a busy machine
-    asyncio.get_running_loop().slow_callback_duration = 3600
-
-async def ask():
-    await asyncio.sleep(3600)
-
-async def wait_in_a_thread():
-    report_no_slow_steps()
-    asyncio.get_running_loop().run_in_executor(None, lambda: (print("asking", flush=True), time.sleep(2)))
-
 async def main():
-    report_no_slow_steps()
-    tasks = [asyncio.create_task(ask()) for _ in range(20)]
+    loop = asyncio.get_running_loop()
+    loop.slow_callback_duration = 3600  # development mode reports slow steps, as a busy machine has them
+    if "thread" in sys.argv:
+        loop.run_in_executor(None, lambda: (print("asking", flush=True), time.sleep(2)))
+        return
     print("asking", flush=True)
     try:
-        await asyncio.gather(*tasks)
+        await asyncio.gather(*(asyncio.sleep(3600) for _ in range(20)))
     finally:
         print("ending", flush=True)
         if "hang" in sys.argv:
             await asyncio.sleep(3600)
 
 try:
-    run_until_interrupted(wait_in_a_thread() if "thread" in sys.argv else main())
-    print("finished", flush=True)
+    run_until_interrupted(main())
 except KeyboardInterrupt:
     print("ended", flush=True)
     sys.exit(7)
 """
+AT_ONCE = "error: interrupted at once; recorded answers are kept; run the same command again to continue\n"
 
 
-def interrupted(*words: str, number: signal.Signals = signal.SIGINT) -> tuple[int, list[str], str]:
-    """Interrupt a process when it asks, and if it hangs again when it ends: its status, what it printed and its errors."""
+@pytest.mark.parametrize(("words", "number", "status", "said", "complained"), [
+    ((), signal.SIGINT, 7, ["asking", "ending", "ended"], ""),
+    (("thread",), signal.SIGINT, 7, ["asking", "ended"], ""),
+    ((), signal.SIGTERM, 128 + signal.SIGTERM, ["asking", "ending"], ""),
+    (("hang",), signal.SIGINT, 130, ["asking", "ending"], AT_ONCE),
+], ids=["once", "while threads are waited for", "terminated", "twice"])  # fmt: skip
+def test_a_signal_ends_everything_in_order_and_a_second_one_at_once(words, number, status, said, complained):
     with subprocess.Popen(
         [sys.executable, "-X", "dev", "-c", CHILD, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None
-        said = []
+        found = []
         for line in process.stdout:
-            said.append(line.strip())
-            if said[-1] == "asking" or (said[-1] == "ending" and "hang" in words):
+            found.append(line.strip())
+            if found[-1] == "asking" or (found[-1] == "ending" and "hang" in words):
                 process.send_signal(number)
-        _, complained = process.communicate(timeout=60)
-        return process.returncode, said, complained
-
-
-@pytest.mark.parametrize(("words", "number", "status", "said"), [
-    ((), signal.SIGINT, 7, ["asking", "ending", "ended"]),
-    (("thread",), signal.SIGINT, 7, ["asking", "ended"]),
-    ((), signal.SIGTERM, 128 + signal.SIGTERM, ["asking", "ending"]),
-], ids=["once", "while threads are waited for", "terminated"])  # fmt: skip
-def test_a_signal_ends_everything_in_order(words, number, status, said):
-    assert interrupted(*words, number=number) == (status, said, "")
-
-
-def test_twice_ends_the_process_in_one_line():
-    status, said, complained = interrupted("hang")
-    assert (status, said) == (130, ["asking", "ending"])
-    assert (
-        complained == "error: interrupted at once; recorded answers are kept; run the same command again to continue\n"
-    )
+        _, errors = process.communicate(timeout=60)
+    assert (process.returncode, found, errors) == (status, said, complained)
 
 
 def make_package(root: Path) -> Path:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -239,31 +240,17 @@ def test_curves_go_to_the_loggers_of_accelerate(place, llama, tmp_path, monkeypa
     from accelerate import tracking
     from accelerate.utils import LoggerType
 
-    seen: list[Any] = []
-
-    class Recorder:
-        name, requires_logging_directory = "tensorboard", True
-
-        def __init__(self, run_name: str, logging_dir: Path) -> None:
-            seen.append((run_name, logging_dir))
-
-        def start(self) -> None:
-            seen.append("start")
-
-        def log(self, values: dict, step: int) -> None:
-            seen.append((step, values))
-
-        def finish(self) -> None:
-            seen.append("finish")
-
-    monkeypatch.setitem(tracking.LOGGER_TYPE_TO_CLASS, "tensorboard", Recorder)
+    tracker = mock.MagicMock(requires_logging_directory=True)
+    monkeypatch.setitem(tracking.LOGGER_TYPE_TO_CLASS, "tensorboard", tracker)
     monkeypatch.setattr(tracking, "get_available_trackers", lambda: [LoggerType.TENSORBOARD])
     run(place, tmp_path / "out", llama, max_steps=2, report_to=["tensorboard"], validation_samples=2)
-    assert seen[:2] == [("distill.train", tmp_path / "out" / "curves"), "start"]
-    assert [entry[0] for entry in seen[2:-1]] == [0, 1, 2, 2]
-    assert {"loss", "learning_rate", "speed/tokens_per_s"} <= seen[3][1].keys()
-    assert "validation/loss" in seen[2][1]
-    assert seen[-1] == "finish"
+    tracker.assert_called_once_with("distill.train", tmp_path / "out" / "curves")
+    begin, *logs, end = (name for name, *_ in tracker.return_value.method_calls)
+    assert (begin, {*logs}, end) == ("start", {"log"}, "finish")
+    logged = [(call.kwargs["step"], call.args[0]) for call in tracker.return_value.log.call_args_list]
+    assert [step for step, _ in logged] == [0, 1, 2, 2]
+    assert {"loss", "learning_rate", "speed/tokens_per_s"} <= logged[1][1].keys()
+    assert "validation/loss" in logged[0][1]
     with pytest.raises(EnvironmentMissing, match=r"not installed.*wandb.*tensorboard.*pip install wandb"):
         run(place, tmp_path / "other", llama, max_steps=1, report_to=["wandb"])
 
