@@ -18,7 +18,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from pydantic import Field
-from specimens_png import png_around
 
 from cosfly.runtime import io as store
 from cosfly.runtime import run_dir
@@ -29,6 +28,7 @@ from cosfly.runtime.journal import Journal
 from cosfly.runtime.json_io import dump_json, read_json, write_json
 from cosfly.runtime.png import areas_png, colours_png, floats_of, floats_png, pixels_of
 from cosfly.runtime.run_dir import Failed, StageFolder, Tally, read_manifest, write_failures
+from specimens import png_around
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):

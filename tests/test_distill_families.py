@@ -10,10 +10,21 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from later import safetensors, torch
 from PIL import Image
 from specimens_families import FAMILIES, TEXT_ONLY, WITH_PICTURES, make_family
-from specimens_students import begun, features_of, log_of, losses_of, nats_of, pixels_of, run, samples_of, trees_of
+from specimens_students import (
+    begun,
+    features_of,
+    log_of,
+    losses_of,
+    nats_of,
+    pixels_of,
+    run,
+    safetensors,
+    samples_of,
+    torch,
+    trees_of,
+)
 
 from cosfly.formats.predictions import read_predictions
 from cosfly.llm.student_chat import limited_picture

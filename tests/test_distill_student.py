@@ -8,10 +8,8 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import later  # noqa: F401  # skips without torch
 import numpy as np
 import pytest
-from later import qwen, safetensors, torch
 from specimens_distill import make_adapter
 from specimens_students import (
     FAST,
@@ -21,8 +19,11 @@ from specimens_students import (
     losses_of,
     nats_of,
     pixels_of,
+    qwen,
     run,
+    safetensors,
     samples_of,
+    torch,
     trees_of,
 )
 

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from later import safetensors, torch
 from processes import is_running, wait_until
 from simulator_serving import free_port
 from specimens_distill import write_set
@@ -28,7 +27,9 @@ from specimens_students import (
     log_of,
     losses_of,
     run,
+    safetensors,
     samples_of,
+    torch,
     trees_of,
 )
 

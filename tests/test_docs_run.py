@@ -22,9 +22,9 @@ import yaml
 from processes import ran
 from simulator_serving import serving
 from specimens_foreign import write_foreign_tree
-from specimens_slopes import sloped_city
 from teacher_server import TeacherServer
 from test_caption_servers import patient
+from test_cosfly_derived_ground import sloped_city
 from test_cosfly_map_kinds import node, write_world
 from test_distill_evaluate import make_encoder
 from test_docs import ALL, PAGES, ROOT, blocks
