@@ -27,7 +27,8 @@ THINKING = (
     "{% if m.role == 'system' and (enable_thinking is undefined or enable_thinking) %}"
     "{{ 'Reasoning effort is set to xhigh.\n\n' }}{% elif m.role == 'assistant' %}"
     "{{ '<think>\n' + (m.reasoning_content or '') | trim + '\n</think>\n\n' }}{% endif %}"
-    "{{ text | trim + '<|im_end|>\n' }}{% endfor %}{% if add_generation_prompt %}{{ '<|im_start|>assistant\n<think>\n' }}"
+    "{{ text | trim + '<|im_end|>\n' }}{% endfor %}"
+    "{% if add_generation_prompt %}{{ '<|im_start|>assistant\n<think>\n' }}"
     "{% if enable_thinking is defined and not enable_thinking %}{{ '\n</think>\n\n' }}{% endif %}{% endif %}"
 )
 # Content is a list of parts, roles are words, and the end has a token of its own.
