@@ -114,14 +114,7 @@ def measured(facts: Facts, name: str, first: int, last: int | None, aspect: str)
     values = series[first : (first if last is None else last) + 1]
     if any(value is None for value in values) or (aspect == "change" and first == last):
         return None
-    match aspect:
-        case "change":
-            return values[-1] - values[0]
-        case "min":
-            return min(values)
-        case "max":
-            return max(values)
-    return values[0]
+    return {"change": values[-1] - values[0], "min": min(values), "max": max(values), "": values[0]}[aspect]
 
 
 @st.composite

@@ -38,9 +38,9 @@ class _Vertices:
         self.rows.append([round(1000 * x), round(1000 * y), round(1000 * z)])
         return len(self.rows) - 1
 
-    def sheet(self, low: tuple[float, float], high: tuple[float, float], step_m: float) -> list:
+    def sheet(self, low: tuple[float, float], high: tuple[float, float], step_m: float, above_m: float = 0.0) -> list:
         xs, ys = (np.linspace(low[k], high[k], max(2, round((high[k] - low[k]) / step_m) + 1)) for k in (0, 1))
-        number = np.array([[self.add(x, y, float(city_height_m(x, y))) for x in xs] for y in ys])
+        number = np.array([[self.add(x, y, float(city_height_m(x, y)) + above_m) for x in xs] for y in ys])
         a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
         return [
             [[int(k) for k in t]]
@@ -77,16 +77,11 @@ def sloped_city(*, terrain: bool = True, streets: bool = True) -> dict:
         }  # fmt: skip
         objects[f"street {row}"] = {"type": "Road", "geometry": [sheet]}
     if streets:
-        wall = vertices.sheet((5.0, 20.0), (5.6, 180.0), 5.0)
+        wall = vertices.sheet((5.0, 20.0), (5.6, 180.0), 5.0, above_m=1.5)
         objects["wall"] = {
             "type": "GenericCityObject", "attributes": {"bgt_type": "muur"},
             "geometry": [{"type": "MultiSurface", "lod": "1", "boundaries": wall}],
         }  # fmt: skip
-        for triangle in wall:  # a metre and a half high
-            for k in triangle[0]:
-                vertices.rows[k][2] = round(
-                    1000 * (float(city_height_m(*(c / 1000 for c in vertices.rows[k][:2]))) + 1.5)
-                )
     return {
         "type": "CityJSON", "version": "2.0", "vertices": vertices.rows, "CityObjects": objects,
         "transform": {"scale": [0.001] * 3, "translate": [CITY_EAST_M, CITY_NORTH_M, 0.0]},

@@ -40,11 +40,6 @@ def town():
     return make_box_map(centers, extents, rotations, [ROADS] + [BUILDINGS] * 40, header=MapHeader(name="Town"))
 
 
-def plain(size_m: float, *walls):
-    half_m = size_m / 2
-    return map_of(("Roads", (half_m, half_m, -0.1), (half_m, half_m, 0.1)), *(("Buildings", *wall) for wall in walls))
-
-
 def test_the_region_of_interest_bounds_every_walk():
     roi = Roi(
         points_world=[(10, 10), (150, 10), (150, 150), (10, 150)], holes=[[(60, 60), (100, 60), (100, 100), (60, 100)]]
@@ -125,9 +120,9 @@ def test_the_stage_writes_paths_report_and_picture(tmp_path):
 
 def test_a_path_that_fails_is_counted_and_the_others_go_on(tmp_path):
     # A yard of 40 m beside a field: starts in the yard have no goal 60 m off.
-    box_map = plain(
-        120.0, ((41.0, 60.0, 1.0), (1.0, 60.0, 1.0)), ((20.0, 41.0, 1.0), (20.0, 1.0, 1.0)),
-        ((20.0, 80.0, 1.0), (20.0, 38.0, 1.0)),
+    box_map = map_of(
+        ("Roads", (60.0, 60.0, -0.1), (60.0, 60.0, 0.1)), ("Buildings", (41.0, 60.0, 1.0), (1.0, 60.0, 1.0)),
+        ("Buildings", (20.0, 41.0, 1.0), (20.0, 1.0, 1.0)), ("Buildings", (20.0, 80.0, 1.0), (20.0, 38.0, 1.0)),
     )  # fmt: skip
     write_boxes(tmp_path / "map.json", box_map)
     cfg = PedestriansConfig(num_paths=12, num_retries=0, min_distance_m=60)

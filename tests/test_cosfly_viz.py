@@ -276,16 +276,10 @@ def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, 
             assert np.array_equal(picture, wanted)
 
 
-@pytest.fixture(scope="module")
-def street_tree(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("overlay")
-    inputs = write_inputs(folder / "inputs", [circling(3)])
-    return render(RenderConfig.model_validate({**DRAWN, "tracks": ["clean"]}), *inputs, folder / "render")
-
-
-def test_four_pictures_of_a_frame(street_tree, tmp_path):
-    boxes = tmp_path / "boxes_3d.json"
-    write_boxes(boxes, street())
+def test_four_pictures_of_a_frame(tmp_path):
+    boxes, *others = write_inputs(tmp_path / "inputs", [circling(3)])
+    cfg = RenderConfig.model_validate({**DRAWN, "tracks": ["clean"]})
+    street_tree = render(cfg, boxes, *others, tmp_path / "render")
     result = obeyed("view", street_tree, "--frame best --out", tmp_path / "a.png", "--map", boxes)
     assert Image.open(tmp_path / "a.png").size == (640, 2 * (180 + 36))
     name = four_panels(street_tree, tmp_path / "b.png", box_map=street())

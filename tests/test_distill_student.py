@@ -51,16 +51,9 @@ def test_a_template_that_writes_something_else_ends_before_the_first_step(place,
         train.run(TrainConfig(**FAST), place / "set", [place / "tree"], folder, tmp_path / "out")
 
 
-@pytest.fixture(scope="module")
-def base(tmp_path_factory) -> Path:
-    folder = make_random_student(tmp_path_factory.mktemp("base") / "student", seed=2)
-    # Any file that servers need.
-    shutil.copy(folder / "generation_config.json", folder / "video_preprocessor_config.json")
-    return folder
-
-
 @pytest.mark.parametrize("changes", [{}, {"r": 3, "use_rslora": True}, {"target_modules": ["q_proj", "up_proj"]}])
-def test_merged_as_peft_merges(base, tmp_path, changes):
+def test_merged_as_peft_merges(tmp_path, changes):
+    base = make_random_student(tmp_path / "student", seed=2)
     folder = make_adapter(base, tmp_path / "adapter", **changes)
     expected = load_student(base, device="cpu", adapter=folder).model.merge_and_unload().state_dict()
     found = safetensors.load_file(merge.run(base, folder, tmp_path / "out") / "model.safetensors")

@@ -171,10 +171,6 @@ def _world(root: Path, target: Path) -> None:
     (target.parent / "world.json").rename(target)
 
 
-def _delft(root: Path, target: Path) -> None:
-    target.write_bytes(gzip.compress(json.dumps(sloped_city()).encode()))
-
-
 def _others_captions(root: Path, target: Path) -> None:
     lines = [
         {"sample_id": c.sample_id, "en": c.en.model_dump(), "zh": c.zh.model_dump()}
@@ -190,7 +186,9 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "town.csv": _shown("install.md", "type,x_m"), "town.geojson": _shown("maps.md", '{"type": "FeatureCollection"'),
     "mine.yaml": _shown("commands.md", "name: mine"),
     "osm.geojson": _tagged, "buildings.geojson": _tagged, "file:captions.jsonl": _others_captions,
-    "progen_world.json": _world, "delft.json.gz": _delft, "work/flown0": copy_of("work/rules"),
+    "progen_world.json": _world,
+    "delft.json.gz": lambda root, target: target.write_bytes(gzip.compress(json.dumps(sloped_city()).encode())),
+    "work/flown0": copy_of("work/rules"),
     "work/flown1": copy_of("work/planner"), "work/copy": copy_of("work/release"),
     "work/unlabelled/render": copy_of("runs/quickstart/render"),
     "Qwen/Qwen3.5-2B": lambda root, target: make_random_student(target),
@@ -244,11 +242,6 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
         yield Place(root, teacher.url, {"2000": carla, "9000": unrealcv})
 
 
-def in_order() -> list[tuple[str, str]]:
-    pages = [*FIRST, *sorted({page for page, _ in ALL} - {*FIRST, *LAST}), *LAST]
-    return [("commands.md", QUICKSTART), *((page, text) for wanted in pages for page, text in ALL if page == wanted)]
-
-
 def test_what_cannot_run_here_is_in_the_documents():
     lines = [" ".join(block.split()) for page in PAGES for block in blocks(page.read_text(encoding="utf-8"))]
     texts = [*lines, *(text for _, text in ALL)]
@@ -266,8 +259,9 @@ def room_on_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(3600)  # 4 minutes on a machine that has nothing else to do
 def test_every_command_runs(place, in_this_process, room_on_the_disk):
-    failed = []
-    for page, text in in_order():
+    failed, pages = [], [*FIRST, *sorted({page for page, _ in ALL} - {*FIRST, *LAST}), *LAST]
+    in_order = [(page, text) for wanted in pages for page, text in ALL if page == wanted]
+    for page, text in [("commands.md", QUICKSTART), *in_order]:
         if any(word in text for word in NOT_HERE):
             continue
         place.make(text)
