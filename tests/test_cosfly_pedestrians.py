@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from specimens_planning import town_walks
 
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.bystanders import Bystander, Bystanders, read_bystanders, write_bystanders
@@ -16,7 +17,6 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths
 from cosfly.formats.roi import Roi
 from cosfly.geometry.axes import DT_S
 from cosfly.maps.boxlist import BoxList
-from cosfly.maps.stage import load_map
 from cosfly.pedestrians.bystanders import bystanders_of, gaps_m
 from cosfly.pedestrians.speed_model import PACES, TimedRoute, take_pace
 from cosfly.pedestrians.stage import PedestriansConfig, make_pedestrian, run, walkable_ground
@@ -138,7 +138,7 @@ def test_a_path_that_fails_is_counted_and_the_others_go_on(tmp_path):
 
 def test_simworld_gives_twenty_of_twenty(shared_data, tmp_path):
     from cosfly.maps.simworld import SimWorldConfig, load
-    from cosfly.simplify.passes import SimplifyConfig, simplify
+    from cosfly.simplify.passes import SimplifyConfig
 
     folder = shared_data / "simworld-progen"
     city = load(SimWorldConfig(world=folder / "progen_world.json", sizes=[folder / "Bbox.json"]))
@@ -288,12 +288,9 @@ def test_points_are_counted_by_where_they_are():
 def shares(cfg: RunConfig, name: str) -> tuple[float, float]:
     """Shares of the walked points of a town, on carriageway away from crossings and on crossings."""
     town = cfg.of_town(name)
-    walking = town.pedestrians
-    ground = walkable_ground(simplify(load_map(town.maps, seed=town.seed), town.simplify), walking)
+    _, ground, walks = town_walks(town, [None] * town.pedestrians.num_paths)
     counts = np.zeros(3)
-    for k in range(walking.num_paths):
-        rng = rng_for(town.seed, "pedestrians", f"path_{k:05d}")
-        walk = make_pedestrian(f"path_{k:05d}", ground, walking, rng).trajectory
+    for walk in walks:
         counts += *count_on_road(walk, ground.footing, ground.grid), len(walk.positions_m)
     return counts[0] / counts[2], counts[1] / counts[2]
 
