@@ -1,15 +1,11 @@
 """The rule teacher: sentences that agree in both languages, true facts, a reason for each decision."""
 
 import re
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from specimens_captions import contradictions_of, write_answers
+from specimens_captions import contradictions_of, cut_flight, write_answers
 
-from caption.schema import WindowConfig
-from caption.stage.windows import cut_windows
 from caption.teachers.rule_decisions import is_shaken, ranked
 from caption.teachers.rules import (
     FAMILIES,
@@ -27,7 +23,6 @@ from caption.verification.references import Fact, look_up, parse_reference
 from cosfly.formats.captions import ACTIONS, TOKENS
 from cosfly.llm.answer_text import cut_sentences
 from cosfly.runtime.seeding import random_bytes
-from specimens import make_flight
 
 SLOT = re.compile(r"\{([^{}]*)\}")
 FIELDS = ("critical_components", "reasoning_trace")
@@ -49,8 +44,7 @@ def facts():
     found = []
     for seed in range(8):
         for variant in ("ORI", "aug_001"):
-            flight, _ = make_flight(30, seed=seed, variant=variant, width_px=640, height_px=360)
-            windows = cut_windows(replace(flight, folder=Path("nowhere")), WindowConfig(require_images=False, stride=2))
+            windows = cut_flight(30, 2, seed=seed, variant=variant, width_px=640, height_px=360)
             found += [measure_facts(window.observed) for window in windows]
     return found
 

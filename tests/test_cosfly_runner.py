@@ -53,7 +53,7 @@ def _items(*payloads):
 MIXED = (("keep", 2), ("drop", "short"), ("fail", "x"), ("keep", 3), ("bug", "y"), ("drop", "short"))
 
 
-def test_everything_is_counted(tmp_path):
+def test_everything_is_counted_and_what_failed_is_done_again(tmp_path):
     finished = run_items(stage_in(tmp_path), _items(*MIXED), make_worker, (tmp_path / "log",))
     found = finished.tally.model_dump()
     assert found == {"input": 6, "kept": 2, "dropped": {"short": 2}, "failed": {"bug": 1, "input": 1}}
@@ -61,6 +61,10 @@ def test_everything_is_counted(tmp_path):
     failures = (tmp_path / "s/failures.jsonl").read_text()
     assert "got x" in failures
     assert "KeyError" in failures
+    (tmp_path / "log").unlink()
+    again = run_items(stage_in(tmp_path), _items(*MIXED), make_worker, (tmp_path / "log",))
+    assert (tmp_path / "log").read_text().split() == ["i2", "i4"]
+    assert again.tally == finished.tally
 
 
 def test_a_record_is_the_last_of_its_item_and_a_failure_undoes_nothing(tmp_path):
@@ -88,15 +92,6 @@ def test_worker_count_does_not_matter(tmp_path):
         return dump_json([r.model_dump(exclude={"seconds"}) for r in finished.records]), finished.tally
 
     assert products(1) == products(2)
-
-
-def test_finished_items_are_not_done_again_and_failed_ones_are(tmp_path):
-    stage, log = stage_in(tmp_path), tmp_path / "log"
-    first = run_items(stage, _items(*MIXED), make_worker, (log,))
-    log.unlink()
-    second = run_items(stage, _items(*MIXED), make_worker, (log,))
-    assert log.read_text().split() == ["i2", "i4"]
-    assert second.tally == first.tally
 
 
 def test_a_dying_worker_loses_no_other_item_and_leaves_the_stage_open(tmp_path):
