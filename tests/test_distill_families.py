@@ -131,9 +131,16 @@ def test_a_picture_takes_the_tokens_that_the_family_s_processor_says(name, place
 def test_a_family_trains_resumes_merges_and_answers(place, family, tmp_path):
     settings: dict[str, Any] = {"max_steps": 4, "save_every_steps": 2, "validation_samples": 2, "learning_rate": 1e-3}
     begun(place, tmp_path / "out", 3, student=family, **settings)
+    assert [path.name for path in (tmp_path / "out/checkpoints").iterdir()] == ["step_00000002"]
+    assert not (tmp_path / "out/manifest.json").exists()
+    with open(tmp_path / "out/log.jsonl", "a") as file:
+        file.write('{"step": 9, "lo')
     adapter = run(place, tmp_path / "out", family, **settings)
-    run(place, tmp_path / "whole", family, **settings)
-    assert log_of(tmp_path / "out") == log_of(tmp_path / "whole")
+    whole = run(place, tmp_path / "whole", family, **settings)
+    for kind in ("loss", "validation"):
+        assert log_of(tmp_path / "out", kind) == log_of(tmp_path / "whole", kind)
+    name = "adapter_model.safetensors"
+    assert (adapter / name).read_bytes() == (whole / name).read_bytes()
     validations = [record["validation"]["loss"] for record in log_of(tmp_path / "out", "validation")]
     assert validations[-1] < validations[0]
     merged = merge.run(family, adapter, tmp_path / "merged")

@@ -21,7 +21,6 @@ from specimens_students import (
     FAST,
     MAX_PIXELS,
     TWELVE,
-    begun,
     inputs_of,
     load,
     log_of,
@@ -102,22 +101,6 @@ def test_adapter_reloads_equal(place, trained):
             logits.append(model.model.eval()(**inputs).logits)
     assert torch.equal(logits[0], logits[1])
     assert not torch.allclose(logits[0], logits[2], atol=0.1)  # and it does something
-
-
-@pytest.mark.slow
-def test_stopped_and_continued_is_the_same(place, tmp_path):
-    out, whole, settings = tmp_path / "out", tmp_path / "whole", {"max_steps": 8}
-    begun(place, out, **settings)
-    assert sorted(path.name for path in (out / "checkpoints").iterdir()) == ["step_00000005", "step_00000006"]
-    assert not (out / "manifest.json").exists()
-    with open(out / "log.jsonl", "a") as file:
-        file.write('{"step": 9, "lo')
-    run(place, out, **settings)
-    run(place, whole, **settings)
-    assert log_of(out) == log_of(whole)
-    assert log_of(out, "validation") == log_of(whole, "validation")
-    name = "adapter/adapter_model.safetensors"
-    assert (out / name).read_bytes() == (whole / name).read_bytes()
 
 
 @pytest.mark.parametrize(("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
