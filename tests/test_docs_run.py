@@ -52,7 +52,7 @@ NOT_HERE = {
     "--env cosfly/": "1,600 frames each; tests/test_cosfly_envs.py flies a list and policies",
     "--out work/round1": "two short flights are too few walks to split; tests/test_distill_dataset.py has more",
     "roi edit ": "it serves until it is stopped; tests/test_cosfly_viz.py draws on its page",
-    "SmolLM2-135M-Instruct.Q4_1.gguf": "a file of 98 MB; tests/test_distill_families.py trains it where it is",
+    "SmolLM2-135M-Instruct.Q4_1.gguf": "a file of 98 MB; tests/test_distill_student.py trains it where it is",
     "--predictions work/infer-cpu": "the answers of that file",
     "http://localhost:11434": "needs Ollama and a model; the commands run with a test server at another port",
     "--teacher vllm:": "vLLM needs an accelerator; tests/test_engines_contract.py holds its engine to the documents",
