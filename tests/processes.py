@@ -2,6 +2,7 @@
 
 import resource
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,12 +18,14 @@ QUICK = Watch(item_limit_s=6.0, heartbeat_s=0.1, check_s=0.4, probe_s=0.3, faile
 @contextmanager
 def full_disk(num_bytes: int) -> Iterator[None]:
     """Limit the size of files: the system cuts the write that exceeds it, as on a full disk."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    limits, kept = resource.getrlimit(resource.RLIMIT_FSIZE), sys.dont_write_bytecode
+    sys.dont_write_bytecode = True  # a module imported now would be cut in __pycache__
     resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, limits[1]))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        sys.dont_write_bytecode = kept
 
 
 def wait_until(holds: Callable[[], object], patience_s: float = 60.0) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -140,8 +139,7 @@ def test_what_is_not_a_release_is_refused(two_splits, tmp_path, format):
 
 
 @pytest.mark.parametrize("format", EXPORTS)
-def test_a_full_disk_leaves_nothing_half_written(two_splits, tmp_path, format, monkeypatch):
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # a module imported now would be cut in __pycache__
+def test_a_full_disk_leaves_nothing_half_written(two_splits, tmp_path, format):
     out = tmp_path / "out"
     with full_disk(1_000), pytest.raises(StorageError, match="the file cannot be written"):
         exported(two_splits, out, format)
