@@ -69,17 +69,12 @@ def change(choose: Choose, what: Callable[[Row], Any]) -> Lie:
     return lie
 
 
-def alter(choose: Choose, **new_of: Callable[[Any], Any]) -> Lie:
-    return change(choose, lambda row: row.update({name: of(row[name]) for name, of in new_of.items()}))
-
-
-def swap(one: Row, other: Row, *names: str) -> None:
-    for name in names:
+def swapped(choose: Choose, a: int, b: int, name: str) -> Lie:
+    def lie(rows: Rows) -> None:
+        one, other = choose(rows)[a], choose(rows)[b]
         one[name], other[name] = other[name], one[name]
 
-
-def swapped(choose: Choose, a: int, b: int, *names: str) -> Lie:
-    return lambda rows: swap(choose(rows)[a], choose(rows)[b], *names)
+    return lie
 
 
 def add(name: str, number: float, *members: str) -> Callable[[Row], None]:
@@ -224,13 +219,13 @@ LIES_OF_ROWS: dict[str, Lie] = {
     "target_depth_against_depth": change(at(seen, 1), add("target_depth_m", 5.0)),
     "poses_of_two_frames_exchanged": lambda rows: with_poses(clean(rows)[4:10:5], clean(rows)[9:3:-5]),
     "pose_jumps": turned(at(clean, 6), add("pose", 20.0, "x_m")),
-    "window_into_the_future": alter(caption, caption_window=lambda w: [i + 1 for i in w]),
+    "window_into_the_future": change(caption, lambda r: r.update(caption_window=[i + 1 for i in r["caption_window"]])),
     "decision_differs_between_languages": put(not_hovering, caption_zh_flight_decision="hover"),
     "decision_and_label_changed_together": put(
         not_hovering, **dict.fromkeys((*DECISIONS, "label"), "hover"), verdict="CONSISTENT"
     ),
     "hard_conflict_called_soft": change(at(captioned, 1), hard_conflict_called_soft),
-    "split_that_leaks": alter(clean, split=lambda old: "test" if old != "test" else "train"),
+    "split_that_leaks": change(clean, lambda r: r.update(split="test" if r["split"] != "test" else "train")),
     "pair_lost": put(clean, pair=None),
 }  # fmt: skip
 LIES_OF_PIXELS: dict[str, Lie] = {

@@ -38,11 +38,6 @@ Row = dict[str, Any]
 CONSTANT = [column.name for column in columns.POINTS if column.constant]
 
 
-def read_all(dataset: Path) -> tuple[ReleaseRecord, list[list[Row]]]:
-    record = read_record(dataset / "release.json")
-    return record, [pq.read_table(dataset / shard.path).to_pylist() for shard in record.shards]
-
-
 def forge(
     dataset: Path,
     out: Path,
@@ -51,7 +46,8 @@ def forge(
 ) -> Path:
     """Copy a release, change all of its rows together, then its record, and make everything that counts or hashes them
     right again."""
-    record, shards = read_all(dataset)
+    record = read_record(dataset / "release.json")
+    shards = [pq.read_table(dataset / shard.path).to_pylist() for shard in record.shards]
     tables = [pq.read_table(dataset / shard.points.path).to_pylist() for shard in record.shards]
     of_row = _points_of(shards, tables)
     all_rows = [row for rows in shards for row in rows]

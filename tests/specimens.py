@@ -5,6 +5,8 @@ boxes and visibilities agree with the poses in `trajectory.json`.
 """
 
 import json
+import struct
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -287,3 +289,20 @@ def _meta(flight: Track, i: int, num_pixels: int) -> FrameMeta:
             drone_rotation=nowhere,
         ),
     )  # fmt: skip
+
+
+def _chunk(name: bytes, data: bytes) -> bytes:
+    body = name + data
+    return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
+
+
+def png_around(
+    packed: bytes, width: int, height: int, kind: int = 2, interlace: int = 0, piece: int = 1 << 20
+) -> bytes:
+    """Give a PNG file around any bytes, whatever its header says of them; checksums are right.
+
+    kind: the colour type; piece: bytes of a chunk of pixels.
+    """
+    parts = [_chunk(b"IDAT", packed[k : k + piece]) for k in range(0, len(packed), piece)]
+    head = _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, kind, 0, 0, interlace))
+    return b"\x89PNG\r\n\x1a\n" + head + b"".join(parts) + _chunk(b"IEND", b"")

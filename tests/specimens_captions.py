@@ -9,11 +9,15 @@ import numpy as np
 from teacher_server import TeacherServer
 
 from caption.answer_formats.formats import FORMATS, Draft
-from caption.schema import CaptionConfig
+from caption.schema import CaptionConfig, Window, WindowConfig
+from caption.stage.windows import cut_windows
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.rules import write_templates
 from caption.verification.facts import Facts
-from cosfly.formats.captions import Coc
+from caption.verification.values import check_values
+from cosfly.formats.captions import Coc, Language
+from cosfly.llm.answer_text import sentences_of
+from specimens import make_flight
 
 VOCABULARY = vocabulary_of(CaptionConfig())  # what ships
 SLOTS = FORMATS["slots"]
@@ -61,6 +65,16 @@ def write_answers(facts: Facts, rng: np.random.Generator, decision: str | None =
     second = SLOTS.read_mirror(chinese, first, facts, True)
     assert isinstance(second, Draft), second
     return first.coc, second.coc
+
+
+def cut_flight(num_points: int, stride: int = 1, **how) -> list[Window]:
+    """Cut a specimen flight of which no pictures exist."""
+    flight = dataclasses.replace(make_flight(num_points, **how)[0], folder=Path("nowhere"))
+    return list(cut_windows(flight, WindowConfig(require_images=False, stride=stride)))
+
+
+def contradictions_of(coc: Coc, facts: Facts, language: Language) -> list[str]:
+    return list(check_values(sentences_of(coc), facts, language).contradictions)
 
 
 QUICK = {"max_tries": 2, "timeout_s": 60.0, "concurrency": 4}

@@ -18,6 +18,19 @@ CHATML = (
     "{% for c in m.content %}{% if c.type == 'image' %}IMAGE{% else %}{{ c.text }}{% endif %}{% endfor %}{% endif %}"
     "{{ '<|im_end|>\n' }}{% endfor %}{% if add_generation_prompt %}{{ '<|im_start|>assistant\n' }}{% endif %}"
 )
+# As the public one of Qwen3.8 does: texts are trimmed, thoughts come from their own field, and the system text begins
+# with how much to think unless thinking is off.
+THINKING = (
+    "{% for m in messages %}{% set text %}{% if m.content is string %}{{ m.content }}{% else %}{% for c in m.content %}"
+    "{% if c.type == 'image' %}IMAGE{% else %}{{ c.text }}{% endif %}{% endfor %}{% endif %}{% endset %}"
+    "{{ '<|im_start|>' + m.role + '\n' }}"
+    "{% if m.role == 'system' and (enable_thinking is undefined or enable_thinking) %}"
+    "{{ 'Reasoning effort is set to xhigh.\n\n' }}{% elif m.role == 'assistant' %}"
+    "{{ '<think>\n' + (m.reasoning_content or '') | trim + '\n</think>\n\n' }}{% endif %}"
+    "{{ text | trim + '<|im_end|>\n' }}{% endfor %}"
+    "{% if add_generation_prompt %}{{ '<|im_start|>assistant\n<think>\n' }}"
+    "{% if enable_thinking is defined and not enable_thinking %}{{ '\n</think>\n\n' }}{% endif %}{% endif %}"
+)
 # Content is a list of parts, roles are words, and the end has a token of its own.
 SMOLVLM = (
     "<|im_start|>{% for m in messages %}{{ m['role'] | capitalize }}"
@@ -80,7 +93,8 @@ def _qwen(kind: str) -> tuple[Any, Any, Any, dict[str, Any]]:
     from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
     marks = ["<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>", "<|video_pad|>"]
-    template = CHATML.replace("IMAGE", f"{{{{ '{QWEN_PICTURE}' }}}}")
+    template = THINKING if kind == "Qwen3_5" else CHATML
+    template = template.replace("IMAGE", f"{{{{ '{QWEN_PICTURE}' }}}}")
     tokenizer = make_tokenizer(["<|endoftext|>", *marks], template, "<|im_end|>")
     ids = {f"{name}_token_id": tokenizer.convert_tokens_to_ids(f"<|{mark}|>") for name, mark in (
         ("image", "image_pad"), ("video", "video_pad"), ("vision_start", "vision_start"), ("vision_end", "vision_end")

@@ -1,18 +1,33 @@
 """Hand-made worlds for planners, and the check that a flight through them is safe."""
 
+import itertools
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
 
 from cosfly.formats.boxes import BoxMap, write_boxes
-from cosfly.formats.pedestrian_paths import PedestrianTrajectory, write_paths
+from cosfly.formats.frames import Camera
+from cosfly.formats.pedestrian_paths import PedestrianTrajectory, walk_id, write_paths
+from cosfly.formats.playback import Perturbation, TargetRecord, Track
+from cosfly.formats.traces import DroneTrace
 from cosfly.geometry import kernels
-from cosfly.geometry.axes import DT_S
+from cosfly.geometry.axes import DT_S, intrinsic_matrix, world_from_camera
+from cosfly.maps.stage import load_map
+from cosfly.pedestrians.stage import make_pedestrian
+from cosfly.pedestrians.walkable import WalkableGround, walkable_ground
+from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.muco.loss import evaluate, make_state
-from cosfly.planners.stage import make_scenario
-from specimens import map_of
+from cosfly.planners.stage import draw_styles_of, make_scenario, plan_trajectory, screens_of
+from cosfly.render.camera import view_target
+from cosfly.runtime.errors import NoPathError
+from cosfly.runtime.seeding import rng_for
+from cosfly.simplify.passes import simplify
+from specimens import make_flight, map_of
 
 
 def walk_along(path_id, corners, speed_mps=1.2, dt_s=DT_S):
@@ -80,3 +95,44 @@ def assert_safe(positions, obstacles, cfg=PlanConfig(), ground_m=0.0):
     shares = np.linspace(0, 1, 51)[:, None, None]
     between = (positions[None, :-1] * (1 - shares) + positions[None, 1:] * shares).reshape(-1, 3)
     assert kernels.signed_distances(obstacles, between)[0].min() > 0
+
+
+def town_walks(
+    town: RunConfig, paces: Sequence[str | None]
+) -> tuple[BoxMap, WalkableGround, list[PedestrianTrajectory]]:
+    """Return the simplified map of a town of a run, its walkable ground, and a walk of each pace; None: any."""
+    box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify)
+    ground, walks = walkable_ground(box_map, town.pedestrians), []
+    for name, pace in zip(map(walk_id, itertools.count()), paces, strict=False):
+        rng = rng_for(town.seed, "pedestrians", name)
+        walks.append(make_pedestrian(name, ground, town.pedestrians, rng, pace).trajectory)
+    return box_map, ground, walks
+
+
+def town_flights(town: RunConfig, paces: Sequence[str | None]) -> Iterator[DroneTrace]:
+    """Yield the planned trajectories of such walks."""
+    box_map, _, walks = town_walks(town, paces)
+    obstacles, screens = kernels.obstacle_index(box_map), screens_of(box_map)
+    for walk, styles in zip(walks, draw_styles_of(walks, town.plan, town.seed), strict=True):
+        with suppress(NoPathError):  # a failure that the stage counts
+            yield plan_trajectory(walk, obstacles, town.plan, town.seed, screens, styles)
+
+
+def track_of(trace: DroneTrace, size_px: tuple[int, int], fov_deg: float) -> Track:
+    """Return the clean track of a trajectory, without pictures."""
+    camera = Camera(*size_px, intrinsic_matrix(*size_px, fov_deg))
+    matrices = [world_from_camera(*pose) for pose in zip(trace.positions_m, trace.rotations_deg, strict=True)]
+    views = [view_target(at_m, pose, camera) for at_m, pose in zip(trace.targets_m, matrices, strict=True)]
+    in_view = np.array([view.in_view for view in views])
+    target = TargetRecord(
+        in_view=in_view, visible=in_view & (trace.visibility > 0), depth_m=np.array([view.depth_m for view in views]),
+        uv=np.array([view.uv for view in views]), bbox=np.array([view.bbox_px for view in views]),
+        visibility=trace.visibility,
+    )  # fmt: skip
+    zero = np.zeros((len(trace.time_s), 3))
+    return replace(
+        make_flight(len(trace.time_s))[0], folder=Path(), camera=camera, time_s=trace.time_s,
+        positions_m=trace.positions_m, rotations_deg=trace.rotations_deg, targets_m=trace.targets_m, target=target,
+        perturbation=Perturbation(np.zeros(len(zero), dtype=bool), zero, zero, zero), segments=trace.segments,
+        mission=trace.mission,
+    )  # fmt: skip

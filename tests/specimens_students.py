@@ -1,5 +1,7 @@
 """A training set of small pictures, a tiny student, and settings under which it learns in seconds."""
 
+import importlib
+import importlib.util
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -18,6 +20,22 @@ from distill.student.random_student import make_random_student
 from distill.training.loss import answer_loss
 from specimens import make_playback_tree
 
+if not all(map(importlib.util.find_spec, ("torch", "transformers", "peft"))):
+    pytest.skip("needs the extra distill", allow_module_level=True)
+
+
+class Later:
+    """A library that is imported when a test first uses it: a worker without such a test does not load it."""
+
+    def __init__(self, module: str) -> None:
+        self._module = module
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(importlib.import_module(self._module), name)
+
+
+safetensors, torch = Later("safetensors.torch"), Later("torch")
+qwen = Later("transformers.models.qwen3_5.modeling_qwen3_5")
 MAX_PIXELS = 64 * 64
 FAST = {
     "max_pixels": MAX_PIXELS, "lora_rank": 4, "learning_rate": 1e-2, "device": "cpu",
@@ -49,8 +67,6 @@ def trees_of(place: Path) -> dict[str, Path]:
 
 def inputs_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Path]) -> dict[str, Any]:
     """All that a model is given of some samples, with their pictures, each looked at anew."""
-    import torch
-
     rows = [own.encode(sample, MAX_PIXELS) for sample in samples]
     tokens = {name: torch.from_numpy(array) for name, array in prompt_batch(own, rows).items()}
     return tokens | pixels_of(own, samples, trees)
@@ -58,8 +74,6 @@ def inputs_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Path]
 
 def pixels_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Path]) -> dict[str, Any]:
     """The inputs of the pictures of some samples, as they are read."""
-    import torch
-
     reader = PictureReader(own, trees, MAX_PIXELS)
     read = [reader.read(picture) for sample in samples for picture in pictures_of(sample)]
     return {name: torch.cat([one[name] for one in read]) for name in (read[0] if read else ())}
@@ -67,8 +81,6 @@ def pixels_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Path]
 
 def features_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Path]) -> list[Tensors]:
     """The features of the pictures of some samples, each encoded by itself."""
-    import torch
-
     reader = PictureReader(own, trees, MAX_PIXELS)
     with torch.no_grad():
         return [encode(own, [reader.read(picture)])[0] for sample in samples for picture in pictures_of(sample)]
@@ -76,8 +88,6 @@ def features_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Pat
 
 def nats_of(own: Student, rows: Sequence[EncodedSample], features: Sequence[Tensors], chunk: int = 64) -> list[float]:
     """The loss of each row in a batch: all other rows weigh nothing."""
-    import torch
-
     found = []
     for number in range(len(rows)):
         weighed = [

@@ -4,13 +4,13 @@ import ast
 import os
 import re
 import shlex
-import subprocess
 import sys
 import tomllib
 from functools import cache
 from pathlib import Path
 
 import pytest
+from processes import ran
 from test_docs import parsed
 
 from cosfly.runtime import limits
@@ -24,10 +24,6 @@ ROOMS = ("runtime", "axes", "formats", "geometry", "viz", "llm", "simulators", "
 # Geometry that knows no file, so that formats may use it.
 BELOW_FORMATS = {f"cosfly.geometry.{name}" for name in ("axes", "motion")}
 ASSEMBLY = ("pipeline", "closed_loop", "envs", "studies", "worldgen")  # what may know all stages and siblings
-HEAVY = {
-    *("torch", "transformers", "peft", "accelerate", "bert_score", "datasets"),
-    *("vllm", "pyrender", "trimesh", "carla", "ray"),
-}
 
 SOURCES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
@@ -46,18 +42,16 @@ def _tree(name: str) -> ast.Module:
 
 
 @cache
-def imports(name: str, *, top_level_only: bool = False) -> set[str]:
+def imports(name: str) -> set[str]:
     """Modules that a source file imports; names taken from a package of ours count as modules if they are."""
     found, nodes = set(), [*_tree(name).body]
     for node in nodes:  # which grows
-        lazy = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-        if (lazy and top_level_only) or (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             continue
         nodes += ast.iter_child_nodes(node)
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{name}: relative import"
             found |= {
                 f"{node.module}.{alias.name}" if f"{node.module}.{alias.name}" in SOURCES else node.module
                 for alias in node.names
@@ -122,21 +116,25 @@ def test_no_step_of_distill_imports_a_step(step):
     assert not {found for name in modules for found in imports(name) if found.startswith(others)}
 
 
-def test_axes_of_the_tree_are_converted_where_its_files_are_read_and_written():
-    importers = {
-        name for name, path in SOURCES.items() if re.search(r"^from .*\bmirror_poses\b", path.read_text(), re.M)
-    }
-    assert importers == {"cosfly.formats.frames", "cosfly.formats.playback_file", "cosfly.simulators.conventions"}
+# What stands in a source, and the only ones where it may.
+ONLY_IN = {
+    # Axes of the tree are converted where its files are read and written.
+    r"^from .*\bmirror_poses\b": {
+        *("cosfly.formats.frames", "cosfly.formats.playback_file", "cosfly.simulators.conventions"),
+    },
+    r"^(import|from) numba\b": {"cosfly.runtime.compiled"},  # compiled functions share one cache
+    # Foreign text is escaped in one place.
+    r"(?i)html import escape|html\.escape|rich\.markup|jinja2|markupsafe|<!doctype": {
+        *("cosfly.runtime.escaping", "cosfly.viz.page"),
+    },
+    r"Console\(": {"cosfly.runtime.console"},
+}
 
 
-def test_heavy_packages_are_imported_where_they_are_used():
-    tops = {name: {n.split(".")[0] for n in imports(name, top_level_only=True)} for name in SOURCES}
-    assert [name for name, top in tops.items() if top & HEAVY] == []
-
-
-def test_compiled_functions_share_one_cache():
-    importers = {name for name, path in SOURCES.items() if re.search(r"^(import|from) numba\b", path.read_text(), re.M)}
-    assert importers == {"cosfly.runtime.compiled"}
+@pytest.mark.parametrize("pattern", ONLY_IN)
+def test_what_is_done_in_one_place_is_done_in_no_other(pattern):
+    found = {name for name, path in SOURCES.items() if re.search(pattern, path.read_text(encoding="utf-8"), re.M)}
+    assert found == ONLY_IN[pattern]
 
 
 # Names that read what stands on disk, or text that stood there. Only the gate calls them: it knows what a file may do.
@@ -188,24 +186,9 @@ def test_help_is_instant():
     one on modules not."""
     program = "import sys; sys.argv = ['cosfly', '--help']; from cosfly.cli import main\ntry: main()\n"
     program += "except SystemExit: pass\nimport time; print('LOADED', time.process_time(), *sorted(sys.modules))"
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    cpu_s, *loaded = result.stdout.split("LOADED")[1].split()
+    cpu_s, *loaded = ran(sys.executable, "-c", program).stdout.split("LOADED")[1].split()
     assert float(cpu_s) < 5
     assert not set(loaded) & {"numpy", "numba", "cv2", "pydantic", "torch", "scipy", "pyarrow", "moderngl"}
-
-
-def test_foreign_text_is_escaped_in_one_place():
-    page, console = (
-        re.compile(r"html import escape|html\.escape|rich\.markup|jinja2|markupsafe|<!doctype", re.IGNORECASE),
-        re.compile(r"Console\("),
-    )
-    texts = {name: path.read_text(encoding="utf-8") for name, path in SOURCES.items()}
-    assert [
-        name
-        for name, text in texts.items()
-        if name not in ("cosfly.runtime.escaping", "cosfly.viz.page") and page.search(text)
-    ] == []
-    assert [name for name, text in texts.items() if name != "cosfly.runtime.console" and console.search(text)] == []
 
 
 def text_of(name: str) -> str:
@@ -250,8 +233,8 @@ def commands_of(tmp_path: Path, arguments: list[str], job: dict[str, str]) -> li
         (tmp_path / name).write_text(f"#!/bin/bash\n{text}\n")
         (tmp_path / name).chmod(0o755)
     environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "COSFLY": "echo cosfly"} | job
-    found = subprocess.run(["bash", SCRIPT, *arguments], env=environment, capture_output=True, text=True, check=True)
-    return [shlex.split(line)[1:] for line in found.stdout.splitlines() if line.startswith("cosfly ")]
+    told = ran("bash", SCRIPT, *arguments, env=environment).stdout
+    return [shlex.split(line)[1:] for line in told.splitlines() if line.startswith("cosfly ")]
 
 
 RUN = ["diverse", "shared/run"]

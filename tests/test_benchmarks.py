@@ -3,12 +3,12 @@
 import os
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from browser import NAMES as BROWSERS
+from processes import ran
 
 FOLDER = Path(__file__).parent / "benchmarks"
 SMALL_TOWN = """
@@ -35,10 +35,7 @@ bench.FITTED_ON = 200
     ("bench_flying", "--flights 2 --decisions 4 --workers 1", r"\d+ decisions in .* a second", HERE),
     ("bench_flying", "--envs", r"2 side by side: .* steps a second",
              "import cosfly.envs.episodes; cosfly.envs.episodes.NUM_DECISIONS = 4"),
-    ("bench_pages", "", r"opens in \d", """
-from cosfly.maps.synthetic import SyntheticConfig, load
-bench.TURNS, bench.census_town = 1, lambda name, seed: load(SyntheticConfig(), seed)
-"""),
+    ("bench_pages", "", r"opens in \d", SMALL_TOWN + "bench.TURNS = 1"),
     ("bench_planning", "--maps a --planners track_astar muco", r"the same loss from the same start",
              SMALL_TOWN + "scenes.NUM_WALKS, bench.WALKS = 1, bench.WALKS.model_copy(update={'num_paths': 1})"),
     ("bench_release", "8 --rounds 1", r"build: \d+ % of the speed of the copy",
@@ -64,11 +61,8 @@ def test_a_benchmark_prints_its_figures(case, request, tmp_path):
     arguments = [f"{name}.py", *words.replace("OUT", str(tmp_path / "out")).split()]
     program = f"import sys, {name} as bench\n{before}\nsys.argv = {arguments!r}\nbench.main()\n"
     paths = [str(FOLDER), str(FOLDER.parent), str(FOLDER.parents[1])]
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-3000:]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+    done = ran(sys.executable, "-c", program, cwd=tmp_path, env=environment)
     assert "Traceback" not in done.stderr
     assert re.search(figures, done.stdout), done.stdout[-3000:]
 

@@ -146,16 +146,10 @@ def place(tmp_path_factory) -> Path:
 
 def label_of(place: Path) -> Callable[[dict], str]:
     """What a student decides that learnt all: the label of the window whose prompt is asked, in either language."""
-    labels: dict[str, str] = {}
-    for caption in read_captions(place / "rules" / "captions.jsonl"):
-        for prompt in caption.prompt.values():
-            labels[key_of(prompt.user)] = caption.label or "track_straight"
-    return lambda body: labels[key_of(body["messages"][1]["content"][-1]["text"])]
-
-
-def key_of(user: str) -> str:
-    """A prompt without its first line, which names the pictures."""
-    return user.partition("\n")[2]
+    captions = read_captions(place / "rules" / "captions.jsonl")
+    # Of a prompt all but its first line, which names the pictures.
+    labels = {p.user.partition("\n")[2]: c.label or "track_straight" for c in captions for p in c.prompt.values()}
+    return lambda body: labels[body["messages"][1]["content"][-1]["text"].partition("\n")[2]]
 
 
 def settings(url: str, folder: Path, **changes: Any) -> CaptionConfig:

@@ -6,25 +6,21 @@ The oracle of numbers (`measured`) reads the series of `Facts` itself; it shares
 import dataclasses
 import json
 import re
-from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from specimens_captions import GAP, SLOTS, report_of, saying, settings
+from specimens_captions import GAP, SLOTS, cut_flight, report_of, saying, settings
 from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror
 
 from caption.answer_formats.formats import Draft, Filler, Refused, fact_table
 from caption.answer_formats.templates import InvalidSlot, read_sentence
-from caption.schema import WindowConfig
 from caption.stage.stage import run
-from caption.stage.windows import cut_windows
 from caption.verification.facts import Facts, measure_facts
 from caption.verification.references import Fact, look_up, parse_reference
 from caption.verification.values import check_values
 from cosfly.formats.captions import Coc, Language, read_captions
 from cosfly.runtime.errors import NothingKept
-from specimens import make_flight
 
 FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, -6.0, -10.0), offset_x_px=(0, 10, 40, None, -64))
 
@@ -90,15 +86,6 @@ def test_a_refused_slot_names_the_fault_and_the_fix():
         assert words in found.complaint
 
 
-def windows_of(num_flights: int) -> list[Facts]:
-    found = []
-    for seed in range(num_flights):
-        flight = dataclasses.replace(make_flight(30, seed=seed, width_px=640, height_px=360)[0], folder=Path("nowhere"))
-        samples = cut_windows(flight, WindowConfig(require_images=False, stride=4))
-        found += [measure_facts(sample.observed, (640, 360)) for sample in samples]
-    return found
-
-
 SERIES = {  # slot -> field, digits, unit in both languages
     "speed": ("speed_mps", 2, "m/s", "米/秒"), "altitude": ("altitude_m", 1, "m", "米"), "pitch": ("pitch_deg", 1, "deg",
         "度"),
@@ -106,7 +93,8 @@ SERIES = {  # slot -> field, digits, unit in both languages
     "box_height": ("box_height_px", 0, "px", "像素"), "offset_x": ("offset_x_px", 0, "px", "像素"),
     "travelled": ("travelled_m", 1, "m", "米"), "bearing": ("bearing_deg", 1, "deg", "度"),
 }  # fmt: skip
-WINDOWS = windows_of(4)
+FLIGHTS = [cut_flight(30, 4, seed=seed, width_px=640, height_px=360) for seed in range(4)]
+WINDOWS = [measure_facts(window.observed, (640, 360)) for windows in FLIGHTS for window in windows]
 
 
 def measured(facts: Facts, name: str, first: int, last: int | None, aspect: str) -> float | None:
@@ -114,14 +102,7 @@ def measured(facts: Facts, name: str, first: int, last: int | None, aspect: str)
     values = series[first : (first if last is None else last) + 1]
     if any(value is None for value in values) or (aspect == "change" and first == last):
         return None
-    match aspect:
-        case "change":
-            return values[-1] - values[0]
-        case "min":
-            return min(values)
-        case "max":
-            return max(values)
-    return values[0]
+    return {"change": values[-1] - values[0], "min": min(values), "max": max(values), "": values[0]}[aspect]
 
 
 @st.composite

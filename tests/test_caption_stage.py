@@ -2,16 +2,14 @@
 
 import asyncio
 import contextlib
-import dataclasses
 import json
 import re
 import shutil
 import threading
 from collections import Counter
-from pathlib import Path
 
 import pytest
-from specimens_captions import VOCABULARY, report_of, saying
+from specimens_captions import VOCABULARY, cut_flight, report_of, saying
 from teacher_server import TeacherServer, is_mirror, obedient_answer
 
 from caption.schema import CaptionConfig, JudgeConfig, RepairConfig, WindowConfig
@@ -28,7 +26,7 @@ from cosfly.formats.playback_file import read_track, write_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.contract import NoAnswer
 from cosfly.runtime.errors import NothingKept, ResumeError, TeacherError
-from specimens import change_json, make_flight, make_playback_tree
+from specimens import change_json, make_playback_tree
 
 
 @pytest.fixture(scope="module")
@@ -176,8 +174,7 @@ CFG = CaptionConfig(window=WindowConfig(require_images=False))
 
 @pytest.mark.parametrize("treatment", ["keep", "repair", "drop"])
 def test_what_becomes_of_a_soft_conflict(treatment):
-    flight = dataclasses.replace(make_flight(60)[0], folder=Path("nowhere"))
-    windows = list(cut_windows(flight, CFG.window))
+    windows = cut_flight(60)
 
     def captioned(repair: RepairConfig) -> list[Caption]:
         cfg = CFG.model_copy(update={"repair": repair})
@@ -203,10 +200,8 @@ def test_what_becomes_of_a_soft_conflict(treatment):
 @pytest.mark.parametrize("strategy", ["anchored", "cascade"])
 def test_a_conflict_without_a_reason_for_its_label_counts_as_not_repaired(strategy):
     cfg = CFG.model_copy(update={"repair": RepairConfig(hard_conflict="repair", soft_conflict="repair")})
-    track = dataclasses.replace(make_flight(60)[0], folder=Path("nowhere"))
-    windows = list(cut_windows(track, cfg.window))
     trials = []
-    for window in windows:
+    for window in cut_flight(60):
         with contextlib.suppress(NoAnswer):  # the first answer has no reason
             trials.append(asyncio.run(try_strategy(window, RuleTeacher(0), cfg, VOCABULARY, strategy)))
     trials = [trial for trial in trials if trial is not None]

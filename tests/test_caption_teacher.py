@@ -10,9 +10,9 @@ import json
 import logging
 import math
 import socket
-import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -239,16 +239,9 @@ def quarantine(out: Path) -> dict[str, dict]:
     return {record["id"]: record for record in map(json.loads, lines)}
 
 
-class Switched:
-    def __init__(self, status: int, text: str, num_good: int = 3) -> None:
-        self.status, self.text, self.num_good, self.num_asked = status, text, num_good, 0
-        self._lock = threading.Lock()
-
-    def __call__(self, body: dict) -> tuple[int, dict] | None:
-        with self._lock:
-            self.num_asked += 1
-            is_good = is_mirror(body) or self.num_asked <= self.num_good
-        return None if is_good else refusal(self.status, self.text)
+def refusing(server: TeacherServer, status: int, text: str, num_good: int = 3) -> Callable:
+    """Refuse every window after so many requests; mirrors are answered."""
+    return lambda body: None if is_mirror(body) or len(server.bodies) <= num_good else refusal(status, text)
 
 
 # What a server says to every window from some time on: status, words, and what the error must say beside them.
@@ -264,8 +257,9 @@ SERVER_FAULTS = {
 @pytest.mark.parametrize("name", SERVER_FAULTS)
 def test_what_is_the_servers_fault_ends_the_run_and_is_no_windows(small_tree, tmp_path, whole, name):
     status, text, words = SERVER_FAULTS[name]
-    out, behaviour = tmp_path / "out", Switched(status, text)
-    with deciding(respond=behaviour) as server:
+    out = tmp_path / "out"
+    with deciding() as server:
+        server.respond = refusing(server, status, text)
         with pytest.raises(TeacherError) as caught:
             run(quick(server.url), small_tree, out)
         assert text in str(caught.value)
@@ -275,7 +269,7 @@ def test_what_is_the_servers_fault_ends_the_run_and_is_no_windows(small_tree, tm
         assert quarantine(out) == {}
         parts = [caption for path in (out / "parts").glob("*") for caption in read_captions(path)]
         assert [caption.checks.refusal for caption in parts if caption.checks.refusal] == []
-        behaviour.num_good = 10**9
+        server.respond = None  # it is mended
         assert run(quick(server.url), small_tree, out).read_bytes() == whole[0]
 
 
@@ -283,16 +277,17 @@ def test_a_server_that_refuses_every_window_ends_the_run_and_retry_failed_asks_a
     small_tree, tmp_path, whole, monkeypatch
 ):
     monkeypatch.setattr("caption.stage.asking.STOP_AFTER_FAILURES", 3)
-    # One good answer, whose mirror may come between the refusals: three in a row are left whatever the order.
-    out, behaviour = tmp_path / "out", Switched(400, NOT_KNOWN, num_good=1)
-    with deciding(respond=behaviour) as server:
+    out = tmp_path / "out"
+    with deciding() as server:
+        # One good answer, whose mirror may come between the refusals: three in a row are left whatever the order.
+        server.respond = refusing(server, 400, NOT_KNOWN, num_good=1)
         cfg = quick(server.url, endpoint={"concurrency": 1})
         with pytest.raises(TeacherError) as caught:
             run(cfg, small_tree, out)
         assert NOT_KNOWN in str(caught.value)
         assert not (out / "manifest.json").exists()
         assert {held["code"] for held in quarantine(out).values()} == {"refused_400"}
-        behaviour.num_good = 10**9
+        server.respond = None  # it is mended
         run(cfg, small_tree, out)
         assert run(cfg, small_tree, out, retry_failed=True).read_bytes() == whole[0]
 

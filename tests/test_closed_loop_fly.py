@@ -61,9 +61,9 @@ def fly(town: Path, out: Path, more: str) -> dict[str, Episode]:
     return {path.stem: read_episode(path) for path in sorted((out / EPISODES).glob("*.json"))}
 
 
-def attempt(town: Path, out: Path, more: str):
+def attempt(town: Path, out: Path, more: str, after: str = ""):
     given = f"--map {town}/maps/boxes_3d.json --simplified {town}/simplify/step2_simplified.json"
-    return invoke(f"fly {TINY} {given} --paths {town}/pedestrians/path.json --out {out} {more}")
+    return invoke(f"fly {TINY} {given} {after or f'--paths {town}/pedestrians/path.json'} --out {out} {more}")
 
 
 @pytest.mark.slow
@@ -259,8 +259,7 @@ STUDENT, FRAMES = "--workers 1 --student track_straight --set fly.tree=false", 5
 
 
 def relabel(town, flown, out, more=""):
-    boxes = f"--map {town}/maps/boxes_3d.json --simplified {town}/simplify/step2_simplified.json"
-    return invoke(f"fly {TINY} {boxes} --relabel {flown} --workers 1 --out {out} --set fly.relabel.stride=8 {more}")
+    return attempt(town, out, f"--workers 1 --set fly.relabel.stride=8 {more}", f"--relabel {flown}")
 
 
 @pytest.mark.slow

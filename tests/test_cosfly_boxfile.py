@@ -279,13 +279,6 @@ def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
     (PLAIN.replace("7,Buildings", "8,Buildings"), "ids must be different whole numbers"),
     (PLAIN.replace(",", ";"), "column type is missing.*separated by commas"),
     ("", "has no boxes"),
-])  # fmt: skip
-def test_all_that_is_wrong_with_a_table_is_told(tmp_path, text, words):
-    with pytest.raises(InputError, match=words):
-        loaded(tmp_path, text)
-
-
-@pytest.mark.parametrize(("text", "words"), [
     (collection(feature("CurvePolygon", [], type="Walls")),
      "feature 1: the geometry CurvePolygon is not supported; expected one of Point"),
     (collection(feature("Polygon", [[[0, 0], [9, 0]]], type="Walls")),
@@ -306,6 +299,6 @@ def test_all_that_is_wrong_with_a_table_is_told(tmp_path, text, words):
     (json.dumps({"type": "Topology"}), "not GeoJSON"),
     (collection(), "has no boxes"),
 ])  # fmt: skip
-def test_all_that_is_wrong_with_geojson_is_told(tmp_path, text, words):
+def test_all_that_is_wrong_with_a_table_or_with_geojson_is_told(tmp_path, text, words):
     with pytest.raises(InputError, match=words):
-        loaded(tmp_path, text, ".geojson")
+        loaded(tmp_path, text, ".geojson" if text.startswith("{") else ".csv")

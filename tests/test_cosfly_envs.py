@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from commands import invoke
 from gymnasium.utils.env_checker import check_env
+from processes import ran
 
 import cosfly.envs
 from cosfly.closed_loop.policy import Policy
@@ -90,28 +90,26 @@ def test_an_observation_has_what_a_drone_knows_and_no_more(follow):
     assert seen["goal"].startswith(("the man in", "the woman in"))
 
 
-def test_an_action_outside_its_bounds_and_a_step_after_the_end_are_refused_in_a_line(follow):
-    follow.reset(seed=0)
-    for action in (np.array([99, 0, 0, 0, 0], dtype=np.float32), 3, None):
-        with pytest.raises(InputError, match="not in the action space"):
-            follow.step(action)
+def test_actions_are_cast_before_their_bounds_are_checked_and_refused_in_a_line(follow):
+    decisions = gymnasium.make(FOLLOW, episodes="test", size_px=SMALL).unwrapped
+    velocities = np.array([1.0, 0, 0, 0, -30]), np.array([1, 0, 0, 0, -30]), [1, 0, 0, 0, -30.0]
+    for env, taken, refused in (
+        (follow, velocities, (np.array([99, 0, 0, 0, 0], dtype=np.float32), 3, None)),
+        (decisions, (3, np.int64(3), np.array([3], dtype=np.int32)), (17, 2.5, [1, 2], "hover")),
+    ):
+        env.reset(seed=0)
+        for action in taken:
+            env.step(action)
+        for action in refused:
+            with pytest.raises(InputError, match="not in the action space"):
+                env.step(action)
+    decisions.close()
+
+
+def test_a_step_after_the_end_is_refused_in_a_line(follow):
     flown(follow, 0, [np.array([0, 0, -4, 0, -30], dtype=np.float32)] * 40)  # into the ground
     with pytest.raises(InputError, match="reset"):
         follow.step(np.zeros(5, dtype=np.float32))
-
-
-def test_actions_are_cast_before_their_bounds_are_checked(follow):
-    follow.reset(seed=0)
-    for action in (np.array([1.0, 0, 0, 0, -30]), np.array([1, 0, 0, 0, -30]), [1, 0, 0, 0, -30.0]):
-        follow.step(action)
-    decisions = gymnasium.make(FOLLOW, episodes="test", size_px=SMALL).unwrapped
-    decisions.reset(seed=0)
-    for action in (3, np.int64(3), np.array([3], dtype=np.int32)):
-        decisions.step(action)
-    for action in (17, 2.5, [1, 2], "hover"):
-        with pytest.raises(InputError, match="not in the action space"):
-            decisions.step(action)
-    decisions.close()
 
 
 @pytest.mark.slow
@@ -169,11 +167,7 @@ def test_wrappers_and_trainers_of_others_run_unmodified(name, tmp_path):
     if name == "stable_baselines3":
         pytest.importorskip(name)
     path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-    done = subprocess.run(
-        [sys.executable, "-c", TRAINERS[name]], cwd=tmp_path, capture_output=True, text=True, check=False,
-        env=os.environ | {"PYTHONPATH": path},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-3000:]
+    ran(sys.executable, "-c", TRAINERS[name], cwd=tmp_path, env=os.environ | {"PYTHONPATH": path})
 
 
 @pytest.mark.slow

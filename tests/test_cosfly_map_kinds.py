@@ -4,6 +4,7 @@ import copy
 import gzip
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -11,12 +12,12 @@ import numpy as np
 import pytest
 import shapely
 from benchmarks.census_town import CENSUS, census_town
-from shapely.geometry import Point, Polygon, box
+from shapely.geometry import Point
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KINDS
 from cosfly.maps.cityjson import CityJsonConfig
-from cosfly.maps.footprints import united
+from cosfly.maps.footprints import footprints, united
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map, run
 from cosfly.runtime.errors import InputError
@@ -181,14 +182,6 @@ def boxes_of(box_map: BoxMap, *kinds: str) -> BoxMap:
     return box_map.select(np.isin(box_map.kinds, [KINDS[kind] for kind in kinds]))
 
 
-def footprint(box_map: BoxMap, row: int, *, with_yaw: bool = True) -> Polygon:
-    """The exact oriented rectangle of a box."""
-    yaw = float(box_map.rotations_deg[row, 1]) if with_yaw else 0.0
-    size = 2 * box_map.half_extents[row, :2]
-    x, y = box_map.centers[row, :2]
-    return shapely.affinity.rotate(box(x - size[0] / 2, y - size[1] / 2, x + size[0] / 2, y + size[1] / 2), yaw)
-
-
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_town_has_what_the_passes_and_the_walks_need(seed):
     town = load_map(MapsConfig(), seed=seed)
@@ -278,9 +271,8 @@ def test_an_asset_without_a_size_is_an_error_or_counted(tmp_path: Path, caplog):
 
 
 def overlapping_pairs(buildings: BoxMap, *, with_yaw: bool) -> int:
-    shapes = [
-        footprint(buildings, row, with_yaw=with_yaw).buffer(-0.025, join_style="mitre") for row in range(len(buildings))
-    ]
+    upright = replace(buildings, rotations_deg=buildings.rotations_deg * with_yaw)
+    shapes = shapely.buffer(footprints(upright), -0.025, join_style="mitre")
     return sum(one.intersects(other) for one, other in combinations(shapes, 2))
 
 
@@ -322,7 +314,7 @@ def test_a_city_model_becomes_boxes_round_the_origin(tmp_path: Path):
     roads = boxes_of(boxes, "Roads")
     assert roads.maxs[:, 2].max() <= 0
     assert roads.half_extents.max() <= 30
-    assert united([footprint(roads, k) for k in range(len(roads))]).area == pytest.approx(360, rel=0.01)
+    assert united([*footprints(roads)]).area == pytest.approx(360, rel=0.01)
     trees = boxes_of(boxes, "Vegetation")
     assert len(trees) > 1
     assert (trees.mins[:, 2] == 0).all()
@@ -344,13 +336,13 @@ def test_courtyards_stay_open(tmp_path: Path):
     }
     boxes = load(tmp_path, document(model))
     houses = boxes_of(boxes, "Buildings")
-    union = united([footprint(houses, k) for k in range(len(houses))])
+    union = united([*footprints(houses)])
     court = Point(20 - boxes.header.offset_m["x"], 20 - boxes.header.offset_m["y"])
     assert union.distance(court) > 7  # 10 m, less what a fill of 0.9 may take
     assert 1319.9 < union.area < 1320 / 0.9
 
 
-def footprints(**attributes: object) -> Model:
+def outlines(**attributes: object) -> Model:
     """A city of footprints without heights, and a road."""
     model = with_an_outline(city())
     (outline,) = model["CityObjects"]["house"]["geometry"]
@@ -375,7 +367,7 @@ def test_declared_heights_raise_footprints(tmp_path):
         ({"measuredHeight": "high"}, None),
         ({"measuredHeight": 1e9}, None),
     ]:
-        box_map = load(tmp_path, document(footprints(**attributes)))
+        box_map = load(tmp_path, document(outlines(**attributes)))
         header, standing = box_map.header, box_map.select(box_map.kinds == KINDS["Buildings"])
         heights = [7.5] if height_m is None else [height_m, 7.5]
         np.testing.assert_allclose(2 * standing.half_extents[:, 2], heights)

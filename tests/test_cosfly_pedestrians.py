@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from specimens_planning import town_walks
 
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.bystanders import Bystander, Bystanders, read_bystanders, write_bystanders
@@ -16,7 +17,6 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths
 from cosfly.formats.roi import Roi
 from cosfly.geometry.axes import DT_S
 from cosfly.maps.boxlist import BoxList
-from cosfly.maps.stage import load_map
 from cosfly.pedestrians.bystanders import bystanders_of, gaps_m
 from cosfly.pedestrians.speed_model import PACES, TimedRoute, take_pace
 from cosfly.pedestrians.stage import PedestriansConfig, make_pedestrian, run, walkable_ground
@@ -38,11 +38,6 @@ def town():
     extents = [[80, 80, 0.1], *np.column_stack([rng.uniform(1, 5, (40, 2)), np.full(40, 3.0)])]
     rotations = np.column_stack([np.zeros(41), [0.0, *rng.uniform(0, 360, 40)], np.zeros(41)])
     return make_box_map(centers, extents, rotations, [ROADS] + [BUILDINGS] * 40, header=MapHeader(name="Town"))
-
-
-def plain(size_m: float, *walls):
-    half_m = size_m / 2
-    return map_of(("Roads", (half_m, half_m, -0.1), (half_m, half_m, 0.1)), *(("Buildings", *wall) for wall in walls))
 
 
 def test_the_region_of_interest_bounds_every_walk():
@@ -127,9 +122,9 @@ def test_the_stage_writes_paths_report_and_picture(tmp_path):
 
 def test_a_path_that_fails_is_counted_and_the_others_go_on(tmp_path):
     # A yard of 40 m beside a field: starts in the yard have no goal 60 m off.
-    box_map = plain(
-        120.0, ((41.0, 60.0, 1.0), (1.0, 60.0, 1.0)), ((20.0, 41.0, 1.0), (20.0, 1.0, 1.0)),
-        ((20.0, 80.0, 1.0), (20.0, 38.0, 1.0)),
+    box_map = map_of(
+        ("Roads", (60.0, 60.0, -0.1), (60.0, 60.0, 0.1)), ("Buildings", (41.0, 60.0, 1.0), (1.0, 60.0, 1.0)),
+        ("Buildings", (20.0, 41.0, 1.0), (20.0, 1.0, 1.0)), ("Buildings", (20.0, 80.0, 1.0), (20.0, 38.0, 1.0)),
     )  # fmt: skip
     write_boxes(tmp_path / "map.json", box_map)
     cfg = PedestriansConfig(num_paths=12, num_retries=0, min_distance_m=60)
@@ -145,7 +140,7 @@ def test_a_path_that_fails_is_counted_and_the_others_go_on(tmp_path):
 
 def test_simworld_gives_twenty_of_twenty(shared_data, tmp_path):
     from cosfly.maps.simworld import SimWorldConfig, load
-    from cosfly.simplify.passes import SimplifyConfig, simplify
+    from cosfly.simplify.passes import SimplifyConfig
 
     folder = shared_data / "simworld-progen"
     city = load(SimWorldConfig(world=folder / "progen_world.json", sizes=[folder / "Bbox.json"]))
@@ -201,20 +196,16 @@ def placed():
     return ground, made
 
 
-def test_nobody_meets_anybody(placed):
-    for walk, bystanders in placed[1]:
+def test_people_walk_where_people_walk_and_nobody_meets_anybody(placed):
+    ground, made = placed
+    assert sum(len(bystanders.others) for _, bystanders in made) >= 20
+    for walk, bystanders in made:
         everybody = np.stack([walk.positions_m, *(other.positions_m for other in bystanders.others)])[:, :, :2]
         for k, one in enumerate(everybody):
             assert len(one) == len(walk.time_s)
             for two in everybody[:k]:
                 assert gaps_m(one, two[None]).min() >= 0.0
                 assert np.linalg.norm(one - two, axis=1).min() >= 0.6
-
-
-def test_people_walk_where_people_walk(placed):
-    ground, made = placed
-    assert sum(len(bystanders.others) for _, bystanders in made) >= 20
-    for walk, bystanders in made:
         for other in bystanders.others:
             step_mps = np.linalg.norm(np.diff(other.positions_m, axis=0), axis=1) / np.diff(walk.time_s)
             assert 0.5 < step_mps.max() <= 2.0
@@ -295,12 +286,9 @@ def test_points_are_counted_by_where_they_are():
 def shares(cfg: RunConfig, name: str) -> tuple[float, float]:
     """Shares of the walked points of a town, on carriageway away from crossings and on crossings."""
     town = cfg.of_town(name)
-    walking = town.pedestrians
-    ground = walkable_ground(simplify(load_map(town.maps, seed=town.seed), town.simplify), walking)
+    _, ground, walks = town_walks(town, [None] * town.pedestrians.num_paths)
     counts = np.zeros(3)
-    for k in range(walking.num_paths):
-        rng = rng_for(town.seed, "pedestrians", f"path_{k:05d}")
-        walk = make_pedestrian(f"path_{k:05d}", ground, walking, rng).trajectory
+    for walk in walks:
         counts += *count_on_road(walk, ground.footing, ground.grid), len(walk.positions_m)
     return counts[0] / counts[2], counts[1] / counts[2]
 

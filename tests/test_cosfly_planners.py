@@ -167,14 +167,10 @@ def random_town(seed):
     return kernels.obstacle_index(town_of(*zip(centers, halves, rng.uniform(-180, 180, 40), strict=True)))
 
 
-def straight_scenario(obstacles, length_m=30.0):
-    return make_scenario(walk_along("w", [(0, 0), (length_m, 0)]), obstacles, CFG)
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
     obstacles = random_town(seed)
-    scenario = straight_scenario(obstacles, 60.0)
+    scenario = make_scenario(walk_along("w", [(0, 0), (60, 0)]), obstacles, CFG)
     raw = foresight.search_trajectory(scenario, foresight.make_lattice(scenario, climbing=False), obstacles, CFG, 3.0)
     points, facts = smoothing.smooth_trajectory(raw, scenario, obstacles, CFG, 3.0)
     assert facts["smooth"]
@@ -260,30 +256,20 @@ def test_costs_are_the_optimum_of_another_library(seed, num_x, num_y, density, i
         assert route_cost(find_route(free, goal, start)) == pytest.approx(optimum, abs=1e-9)
 
 
-def random_boxes(rng, count):
-    turn = rng.uniform(-np.pi, np.pi, count)
-    rotations = np.zeros((count, 3, 3))
-    rotations[:, 0, 0] = rotations[:, 1, 1] = np.cos(turn)
-    rotations[:, 1, 0], rotations[:, 0, 1], rotations[:, 2, 2] = np.sin(turn), -np.sin(turn), 1.0
-    centers = rng.uniform(-40, 40, (count, 3)) * [1, 1, 0.3] + [0, 0, 10]
-    return kernels.index_boxes(centers, rng.uniform(0.2, 6, (count, 3)), rotations)
-
-
 def test_a_flight_does_not_depend_on_the_memory(monkeypatch):
-    cfg, rng = PlanConfig(), np.random.default_rng(0)
-    obstacles = random_boxes(rng, 60)
-    obstacles.rows[:, 2] = 0.0  # low boxes: some hide the walk, some stand in the way
-    obstacles = kernels.index_boxes(
-        obstacles.rows[:, :3], obstacles.rows[:, 3:6] * [1, 1, 4], obstacles.rows[:, 6:15].reshape(-1, 3, 3)
-    )
+    rng = np.random.default_rng(1)  # low boxes: some hide the walk, some stand in the way
+    rows = [
+        ((*rng.uniform(-40, 40, 2), 0), rng.uniform(0.2, 6, 3) * [1, 1, 4], rng.uniform(-180, 180)) for _ in range(120)
+    ]
+    obstacles = kernels.obstacle_index(town_of(*rows))
     targets = np.column_stack([np.linspace(-30, 30, 80), np.full(80, 2.0), np.full(80, 1.0)])
-    scenario = Scenario("w", targets, np.zeros(len(targets)), follow(targets, cfg))
-    problem = muco.make_problem(scenario, cfg)
-    first, _ = muco.start_trajectory(scenario, problem, obstacles, cfg)
-    points, solver, history = muco.optimize(first, problem, obstacles, cfg.muco)
+    scenario = Scenario("w", targets, np.zeros(len(targets)), follow(targets, CFG))
+    problem = muco.make_problem(scenario, CFG)
+    first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
+    points, solver, history = muco.optimize(first, problem, obstacles, CFG.muco)
     monkeypatch.setattr(step, "remember_boxes", lambda *_: None)
     monkeypatch.setattr(muco, "descend", step.descend.py_func)  # the loop in Python, so that it calls what is set above
-    without, solver_without, history_without = muco.optimize(first, problem, obstacles, cfg.muco)
+    without, solver_without, history_without = muco.optimize(first, problem, obstacles, CFG.muco)
     np.testing.assert_array_equal(points, without)
     np.testing.assert_array_equal(history, history_without)
     assert solver == solver_without

@@ -15,7 +15,6 @@ import pyarrow.parquet as pq
 import pytest
 from commands import invoke
 from pydantic import BaseModel
-from specimens_png import png_around
 
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.frames import depth_bytes, read_depth, rgb_bytes
@@ -28,7 +27,7 @@ from cosfly.runtime.io import LinkedPath, inside, read_text
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.run_dir import StageFolder, read_failures
 from release.record import RELEASE_FORMAT, read_record
-from specimens import make_playback_tree
+from specimens import make_playback_tree, png_around
 
 
 class _Dated(Config):

@@ -12,15 +12,18 @@ from test_renderers_contract import circling, pose_towards, street, write_inputs
 
 from cosfly.formats.boxes import BoxMap, make_box_map
 from cosfly.formats.bystanders import Bystander, Bystanders, write_bystanders
-from cosfly.formats.frames import Camera, Look, frame_name, read_depth, read_instance, read_meta, read_rgb
+from cosfly.formats.frames import Camera, Look, frame_name, read_instance, read_meta
+from cosfly.formats.inspection import read_inspection
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.people import Appearance, People
 from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
-from cosfly.geometry.axes import intrinsic_matrix, look_at, wrap_deg
+from cosfly.geometry.axes import intrinsic_matrix, look_at, mask_box, wrap_deg
 from cosfly.geometry.goals import SIDES
 from cosfly.geometry.kernels import obstacle_index, signed_distances
+from cosfly.inspection.settings import InspectConfig
+from cosfly.inspection.stage import run as inspect_tree
 from cosfly.render.camera import rendered_visibility, view_target
 from cosfly.render.contract import (
     MAX_BOX_ID,
@@ -41,7 +44,7 @@ from cosfly.render.stage import make_track_script, open_renderer, run
 from cosfly.render.track import find_goal, render_track
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import ConfigError
-from cosfly.runtime.io import read_checksums, sha256_file
+from cosfly.runtime.io import read_checksums
 
 ALL_MESHES = unit_meshes.all_meshes()
 CAMERA = Camera(320, 180, intrinsic_matrix(320, 180, 90.0))
@@ -270,55 +273,39 @@ def finished(tmp_path_factory):
     return run(build(RenderConfig, SMALL, "test"), *inputs, folder / "out", seed=5), inputs
 
 
-def test_the_tree_is_complete_and_readable(finished):
-    tree, _ = finished
+def test_the_tree_is_complete_and_readable_and_shows_what_its_annotation_says(finished, tmp_path):
+    """The inspection checks files, digests, masks, depths and boxes against poses."""
+    tree, (_, simplified, traces) = finished
     assert len(read_public(tree)) == 2  # the strictest public reader
     folders = find_tracks(tree)
     names = [str(f.relative_to(tree)) for f in folders]
     assert names == [f"Town_Street/trajectory_{1776000000 + k}/{v}" for k in (0, 2) for v in ("ORI", "aug_001")]
+    loose = {"five_ray_mean_min": 0, "clearance_min_m": 0, "legible_min": 0}  # a hand-made flight of a small person
+    found = read_inspection(inspect_tree(InspectConfig(**loose), simplified, traces, tree, tmp_path / "inspect"))
+    assert [issue for one in found.flights for issue in one.issues if issue.severity == "error"] == []
     for folder in folders:
         flight = read_track(folder)  # strict
-        assert not flight.missing_frames()
         assert flight.is_original == (folder.name == "ORI")
-        checksums = read_checksums(folder)
         on_disk = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()} - {"checksums.sha256"}
-        assert set(checksums) == on_disk
-        assert all(sha256_file(folder / name) == digest for name, digest in checksums.items())
-    manifest = json.loads((tree / "manifest.json").read_text())
-    assert manifest["counts"] == {"input": 4, "kept": 4, "dropped": {}, "failed": {}}
-    assert (manifest["num_traces"], manifest["num_traces_not_rendered"], manifest["num_frames"]) == (3, 1, 18)
-
-
-def test_frames_hold_what_their_annotation_says(finished):
-    tree, _ = finished
-    for folder in find_tracks(tree):
-        flight = read_track(folder)
+        assert set(read_checksums(folder)) == on_disk
         for i in range(len(flight)):
             frame = flight.frame_folder(i)
-            kinds, ids = read_instance(frame)
-            depth, meta = read_depth(frame), read_meta(frame)
-            assert read_rgb(frame).shape == (90, 160, 3)
-            assert depth.shape == kinds.shape == (90, 160)
+            meta, ids = read_meta(frame), read_instance(frame)[1]
             assert (meta.index, meta.variant) == (i, folder.name)
             assert meta.target.num_pixels == int((ids == PERSON_ID).sum()) > 0
             assert meta.target.visible == bool(flight.target.visible[i])
             assert meta.target.visibility == pytest.approx(flight.target.visibility[i], abs=1e-6)
-            tree_y = json.loads((frame / "meta.json").read_text())["drone_pose"]["y"]
-            assert tree_y == -meta.drone_pose[1] == pytest.approx(-flight.positions_m[i, 1]), (
-                "the tree's axes are CARLA's"
+            assert (
+                meta.target.mask_bbox_2d == flight.target.mask_bbox[i].tolist() == mask_box(ids == PERSON_ID).tolist()
             )
+            tree_y = json.loads((frame / "meta.json").read_text())["drone_pose"]["y"]
+            told_y = pytest.approx(-flight.positions_m[i, 1])
+            assert tree_y == -meta.drone_pose[1] == told_y, "the tree's axes are CARLA's"
             assert meta.look == Look(), "sun and air of the picture"
             assert meta.camera.intrinsic == flight.camera.intrinsic.tolist()
-            u, v = flight.target.uv[i]
-            x0, y0, x1, y1 = flight.target.bbox[i]
-            assert x0 <= u <= x1
-            assert y0 <= v <= y1
-            rows, columns = np.nonzero(ids == PERSON_ID)
-            assert columns.min() >= x0 - 2
-            assert columns.max() <= x1 + 2
-            seen = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
-            assert flight.target.mask_bbox[i].tolist() == meta.target.mask_bbox_2d == seen
-            assert np.abs(np.median(depth[ids == PERSON_ID]) - flight.target.depth_m[i]) < 0.5
+    manifest = json.loads((tree / "manifest.json").read_text())
+    assert manifest["counts"] == {"input": 4, "kept": 4, "dropped": {}, "failed": {}}
+    assert (manifest["num_traces"], manifest["num_traces_not_rendered"], manifest["num_frames"]) == (3, 1, 18)
 
 
 class Curtain:

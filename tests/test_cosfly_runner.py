@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from processes import QUICK, children_of, is_running, wait_until
+from processes import QUICK, children_of, is_running, ran, wait_until
 from toy_workers import items_of, make_faulty, stage_in
 
 import cosfly
@@ -54,7 +54,7 @@ def _items(*payloads):
 MIXED = (("keep", 2), ("drop", "short"), ("fail", "x"), ("keep", 3), ("bug", "y"), ("drop", "short"))
 
 
-def test_everything_is_counted(tmp_path):
+def test_everything_is_counted_and_what_failed_is_done_again(tmp_path):
     finished = run_items(stage_in(tmp_path), _items(*MIXED), make_worker, (tmp_path / "log",))
     found = finished.tally.model_dump()
     assert found == {"input": 6, "kept": 2, "dropped": {"short": 2}, "failed": {"bug": 1, "input": 1}}
@@ -62,6 +62,10 @@ def test_everything_is_counted(tmp_path):
     failures = (tmp_path / "s/failures.jsonl").read_text()
     assert "got x" in failures
     assert "KeyError" in failures
+    (tmp_path / "log").unlink()
+    again = run_items(stage_in(tmp_path), _items(*MIXED), make_worker, (tmp_path / "log",))
+    assert (tmp_path / "log").read_text().split() == ["i2", "i4"]
+    assert again.tally == finished.tally
 
 
 def test_a_record_is_the_last_of_its_item_and_a_failure_undoes_nothing(tmp_path):
@@ -89,15 +93,6 @@ def test_worker_count_does_not_matter(tmp_path):
         return dump_json([r.model_dump(exclude={"seconds"}) for r in finished.records]), finished.tally
 
     assert products(1) == products(2)
-
-
-def test_finished_items_are_not_done_again_and_failed_ones_are(tmp_path):
-    stage, log = stage_in(tmp_path), tmp_path / "log"
-    first = run_items(stage, _items(*MIXED), make_worker, (log,))
-    log.unlink()
-    second = run_items(stage, _items(*MIXED), make_worker, (log,))
-    assert log.read_text().split() == ["i2", "i4"]
-    assert second.tally == first.tally
 
 
 def test_a_dying_worker_loses_no_other_item_and_leaves_the_stage_open(tmp_path):
@@ -256,66 +251,47 @@ CHILD = """
 import asyncio, sys, time
 from cosfly.llm.contract import run_until_interrupted
 
-def report_no_slow_steps():  # as development mode would on a busy machine
-    asyncio.get_running_loop().slow_callback_duration = 3600
-
-async def ask():
-    await asyncio.sleep(3600)
-
-async def wait_in_a_thread():
-    report_no_slow_steps()
-    asyncio.get_running_loop().run_in_executor(None, lambda: (print("asking", flush=True), time.sleep(2)))
-
 async def main():
-    report_no_slow_steps()
-    tasks = [asyncio.create_task(ask()) for _ in range(20)]
+    loop = asyncio.get_running_loop()
+    loop.slow_callback_duration = 3600  # development mode reports slow steps, as a busy machine has them
+    if "thread" in sys.argv:
+        loop.run_in_executor(None, lambda: (print("asking", flush=True), time.sleep(2)))
+        return
     print("asking", flush=True)
     try:
-        await asyncio.gather(*tasks)
+        await asyncio.gather(*(asyncio.sleep(3600) for _ in range(20)))
     finally:
         print("ending", flush=True)
         if "hang" in sys.argv:
             await asyncio.sleep(3600)
 
 try:
-    run_until_interrupted(wait_in_a_thread() if "thread" in sys.argv else main())
-    print("finished", flush=True)
+    run_until_interrupted(main())
 except KeyboardInterrupt:
     print("ended", flush=True)
     sys.exit(7)
 """
+AT_ONCE = "error: interrupted at once; recorded answers are kept; run the same command again to continue\n"
 
 
-def interrupted(*words: str, number: signal.Signals = signal.SIGINT) -> tuple[int, list[str], str]:
-    """Interrupt a process when it asks, and if it hangs again when it ends: its status, what it printed and its errors."""
+@pytest.mark.parametrize(("words", "number", "status", "said", "complained"), [
+    ((), signal.SIGINT, 7, ["asking", "ending", "ended"], ""),
+    (("thread",), signal.SIGINT, 7, ["asking", "ended"], ""),
+    ((), signal.SIGTERM, 128 + signal.SIGTERM, ["asking", "ending"], ""),
+    (("hang",), signal.SIGINT, 130, ["asking", "ending"], AT_ONCE),
+], ids=["once", "while threads are waited for", "terminated", "twice"])  # fmt: skip
+def test_a_signal_ends_everything_in_order_and_a_second_one_at_once(words, number, status, said, complained):
     with subprocess.Popen(
         [sys.executable, "-X", "dev", "-c", CHILD, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None
-        said = []
+        found = []
         for line in process.stdout:
-            said.append(line.strip())
-            if said[-1] == "asking" or (said[-1] == "ending" and "hang" in words):
+            found.append(line.strip())
+            if found[-1] == "asking" or (found[-1] == "ending" and "hang" in words):
                 process.send_signal(number)
-        _, complained = process.communicate(timeout=60)
-        return process.returncode, said, complained
-
-
-@pytest.mark.parametrize(("words", "number", "status", "said"), [
-    ((), signal.SIGINT, 7, ["asking", "ending", "ended"]),
-    (("thread",), signal.SIGINT, 7, ["asking", "ended"]),
-    ((), signal.SIGTERM, 128 + signal.SIGTERM, ["asking", "ending"]),
-], ids=["once", "while threads are waited for", "terminated"])  # fmt: skip
-def test_a_signal_ends_everything_in_order(words, number, status, said):
-    assert interrupted(*words, number=number) == (status, said, "")
-
-
-def test_twice_ends_the_process_in_one_line():
-    status, said, complained = interrupted("hang")
-    assert (status, said) == (130, ["asking", "ending"])
-    assert (
-        complained == "error: interrupted at once; recorded answers are kept; run the same command again to continue\n"
-    )
+        _, errors = process.communicate(timeout=60)
+    assert (process.returncode, found, errors) == (status, said, complained)
 
 
 def make_package(root: Path) -> Path:
@@ -344,9 +320,6 @@ def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
             f"from cosfly.runtime.compiled import njit\n\n\n@njit(cache=True)\ndef f(x):\n    return {factor} * x\n"
         )
         code = "from cosfly.upper import g; print(g(7), sum(g.stats.cache_hits.values()))"
-        done = subprocess.run(
-            [sys.executable, "-c", code], env=env, cwd=tmp_path, capture_output=True, text=True, check=True
-        )
-        printed.append(done.stdout.split())
+        printed.append(ran(sys.executable, "-c", code, env=env, cwd=tmp_path).stdout.split())
     assert printed == [["14", "0"], ["21", "0"], ["14", "1"]]  # what was compiled for the first sources is still there
     assert len(list((tmp_path / "cache" / "cosfly").iterdir())) == 2

@@ -18,7 +18,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from pydantic import Field
-from specimens_png import png_around
 
 from cosfly.runtime import io as store
 from cosfly.runtime import run_dir
@@ -29,6 +28,7 @@ from cosfly.runtime.journal import Journal
 from cosfly.runtime.json_io import dump_json, read_json, write_json
 from cosfly.runtime.png import areas_png, colours_png, floats_of, floats_png, pixels_of
 from cosfly.runtime.run_dir import Failed, StageFolder, Tally, read_manifest, write_failures
+from specimens import png_around
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
@@ -97,15 +97,14 @@ class Demo(Config):
     threads: MayDiffer[int] = 1
 
 
-def _open(out, **changes):
-    arguments = {"config": Demo(), "inputs": {}, "seed": 0, **changes}
-    return StageFolder.open(out, "demo", **arguments)
+def _open(out: Path, name: str = "demo", **changes) -> StageFolder:
+    return StageFolder.open(out, name, **{"config": Demo(), "inputs": {}, "seed": 0, **changes})
 
 
-def _finished(out, tally: Tally | None = None, **changes) -> StageFolder:
-    stage = _open(out, **changes)
-    write_json(out / "product.json", 1)
-    stage.finish([out / "product.json"], tally or Tally(input=1, kept=1), extra_fact=7)
+def _finished(out: Path, tally=Tally(input=1, kept=1), name: str = "demo", file: str = "product.json", **changes):
+    stage = _open(out, name, **changes)
+    write_json(out / file, f"of {name}")
+    stage.finish([out / file], tally, extra_fact=7)
     return stage
 
 
@@ -239,20 +238,13 @@ def test_checksums_round_trip(tmp_path):
         store.read_checksums(tmp_path)
 
 
-def begin(out: Path, name: str, **inputs: Path) -> StageFolder:
-    return StageFolder.open(out, name, config=Config(), inputs=inputs, seed=0)
-
-
-def make(out: Path, name: str, files: dict[str, str], **inputs: Path) -> Path:
-    stage = begin(out, name, **inputs)
-    for file, text in files.items():
-        write_bytes(out / file, text.encode())
-    stage.finish([out / file for file in files], Tally(input=1, kept=1))
-    return out
+def make(folder: Path, file: str, **inputs: Path) -> Path:
+    """Finish a stage with the name of its folder; give its product."""
+    return _finished(folder, name=folder.name, file=file, inputs=inputs).path / file
 
 
 def make_tree(out: Path, text: str = "", **inputs: Path) -> Path:
-    stage = begin(out, "render", **inputs)
+    stage = _open(out, "render", inputs=inputs)
     outputs = []
     for flight in ("Town1/trajectory_1/ORI", "Town1/trajectory_2/ORI"):
         folder = out / flight
@@ -267,10 +259,9 @@ def make_tree(out: Path, text: str = "", **inputs: Path) -> Path:
 
 @pytest.fixture
 def run(tmp_path) -> Path:
-    boxes = make(tmp_path / "simplify", "simplify", {"map.json": "boxes"}) / "map.json"
-    traces = make(tmp_path / "plan", "plan", {"traces.json": "flights"}, map=boxes) / "traces.json"
-    tree = make_tree(tmp_path / "render", simplified=boxes, traces=traces)
-    make(tmp_path / "caption", "caption", {"captions.jsonl": "a\nb\n"}, data=tree)
+    boxes = make(tmp_path / "simplify", "map.json")
+    tree = make_tree(tmp_path / "render", simplified=boxes, traces=make(tmp_path / "plan", "traces.json", map=boxes))
+    make(tmp_path / "caption", "captions.jsonl", data=tree)
     return tmp_path
 
 
@@ -281,7 +272,7 @@ def inputs_of(run: Path) -> dict[str, Path]:
 
 def test_what_belongs_together_is_taken(run):
     found = run_dir.checked_inputs(inputs_of(run))
-    assert found["simplified"].sha256 == sha256_bytes(b"boxes")
+    assert found["simplified"].sha256 == sha256_file(run / "simplify/map.json")
     listed = read_json(run / "render/manifest.json")["outputs"]
     assert found["data"].sha256 == sha256_bytes(dump_json(listed).encode()), "as in the records of earlier runs"
 
@@ -292,7 +283,7 @@ def test_captions_of_another_tree_are_refused(run):
         VerifyError, match=r"captions\.jsonl: captions.jsonl was made with another input .data.*got .*other"
     ):
         run_dir.checked_inputs(inputs_of(run) | {"data": other})
-    captions = make(run / "c2", "caption", {"captions.jsonl": "c"}, data=other) / "captions.jsonl"
+    captions = make(run / "second/caption", "captions.jsonl", data=other)
     two = {"0.data": run / "render", "0.captions": run / "caption/captions.jsonl"}
     two |= {"1.data": other, "1.captions": captions}
     run_dir.checked_inputs(two)
@@ -315,7 +306,7 @@ def test_a_name_that_no_record_can_hold(tmp_path):
     path = tmp_path / os.fsdecode(b"bad\xff.json")
     write_json(path, [])
     with pytest.raises(InputError, match=r"bad\\udcff.json: the path of an input contains a name that is not UTF-8"):
-        begin(tmp_path / "out", "simplify", map=path)
+        _open(tmp_path / "out", inputs={"map": path})
     assert not (tmp_path / "out").exists()
 
 

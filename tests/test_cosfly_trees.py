@@ -48,10 +48,6 @@ def foreign(tmp_path_factory) -> Path:
     return write_foreign_tree(tmp_path_factory.mktemp("foreign"))
 
 
-def copied(tree: Path, target: Path) -> Path:
-    return shutil.copytree(tree, target, copy_function=os.link)
-
-
 KEPT = CaptionConfig.model_validate({"repair": {"hard_conflict": "keep"}})  # every window has a caption
 
 
@@ -164,7 +160,7 @@ def test_nobody_is_no_target(foreign):
 
 
 def test_the_clean_twin_is_the_track_beside_it(foreign, tmp_path):
-    tree = copied(foreign, tmp_path / "tree")
+    tree = shutil.copytree(foreign, tmp_path / "tree", copy_function=os.link)
     clean, shaken = (read_track(tree / "Town01/trajectory_1777083733" / variant) for variant in ("ORI", "aug_001"))
     twin = read_twin(shaken)
     assert twin is not None
@@ -277,11 +273,6 @@ def tree(tmp_path_factory):
     return make_playback_tree(tmp_path_factory.mktemp("tree"), num_flights=1, num_points=6)
 
 
-@pytest.fixture
-def clean(tree):
-    return find_tracks(tree)[0]
-
-
 def rewrite(folder, target, change):
     new = target / "Town01" / folder.parent.name / folder.name
     new.mkdir(parents=True, exist_ok=True)
@@ -289,7 +280,7 @@ def rewrite(folder, target, change):
     return new
 
 
-def test_deviations_from_the_layout_are_noted(clean, tmp_path):
+def test_deviations_from_the_layout_are_noted(tree, tmp_path):
     for change, words in (
         (lambda v: v.update(schema="x"), "schema.*'x'"),
         (lambda v: v.update(schema_version="6.9.0"), "schema_version"),
@@ -300,7 +291,7 @@ def test_deviations_from_the_layout_are_noted(clean, tmp_path):
         (lambda v: v["points"][-1]["timing"].update(trace_timestamp=9), "steps of"),
         (lambda v: v["points"][4].pop("target"), "target.*missing"),
     ):
-        first = read_track(rewrite(clean, tmp_path, change)).issues[0]
+        first = read_track(rewrite(find_tracks(tree)[0], tmp_path, change)).issues[0]
         assert re.search(words, str(first)), words
 
 

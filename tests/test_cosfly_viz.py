@@ -1,18 +1,25 @@
-"""Pages and pictures: the viewer in a browser, the views of a frame for teachers, students and people, boxes over a frame."""
+"""Pages and pictures: the viewer in a browser, the views of a frame for teachers, students and people, boxes over a frame.
+
+The editor of regions of interest: drawn, saved, walked in; what is refused.
+"""
 
 import asyncio
 import base64
+import contextlib
 import hashlib
+import http.client
 import io
 import json
 import re
+import threading
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from browser import browser
+from browser import Page, browser
 from commands import obeyed
 from PIL import Image
 from specimens_captions import VOCABULARY
@@ -24,15 +31,21 @@ from caption.stage.window_loop import caption_window
 from caption.stage.windows import cut_windows
 from caption.teachers.prompts import make_question, question_messages
 from caption.teachers.teacher import RuleTeacher, encode_frame
-from cosfly.formats.boxes import write_boxes
+from cosfly.formats.boxes import BoxMap, write_boxes
 from cosfly.formats.captions import PICTURES_MARK, Language, write_captions
+from cosfly.formats.pedestrian_paths import read_paths
 from cosfly.formats.playback_file import read_track
+from cosfly.formats.roi import read_roi
 from cosfly.formats.tracks import find_tracks
+from cosfly.geometry.grid import roi_mask
 from cosfly.llm.student_chat import encoded_image
+from cosfly.pedestrians.roi_editor import open_editor
+from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run as render
 from cosfly.runtime.errors import InputError
 from cosfly.viz.gallery import four_panels
+from cosfly.viz.page_server import PageServer
 from cosfly.viz.viewer import run
 from distill.inference.answers import EngineAnswers
 from distill.inference.samples import InferConfig, Inputs
@@ -276,16 +289,10 @@ def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, 
             assert np.array_equal(picture, wanted)
 
 
-@pytest.fixture(scope="module")
-def street_tree(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("overlay")
-    inputs = write_inputs(folder / "inputs", [circling(3)])
-    return render(RenderConfig.model_validate({**DRAWN, "tracks": ["clean"]}), *inputs, folder / "render")
-
-
-def test_four_pictures_of_a_frame(street_tree, tmp_path):
-    boxes = tmp_path / "boxes_3d.json"
-    write_boxes(boxes, street())
+def test_four_pictures_of_a_frame(tmp_path):
+    boxes, *others = write_inputs(tmp_path / "inputs", [circling(3)])
+    cfg = RenderConfig.model_validate({**DRAWN, "tracks": ["clean"]})
+    street_tree = render(cfg, boxes, *others, tmp_path / "render")
     result = obeyed("view", street_tree, "--frame best --out", tmp_path / "a.png", "--map", boxes)
     assert Image.open(tmp_path / "a.png").size == (640, 2 * (180 + 36))
     name = four_panels(street_tree, tmp_path / "b.png", box_map=street())
@@ -295,3 +302,119 @@ def test_four_pictures_of_a_frame(street_tree, tmp_path):
     assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), np.asarray(Image.open(tmp_path / "b.png")))
     with pytest.raises(InputError):
         four_panels(street_tree, tmp_path / "a.png", frame="../../elsewhere", box_map=street())
+
+
+CFG = PedestriansConfig(num_paths=2, min_distance_m=20, max_distance_m=40, min_component_cells=50)
+SQUARE = [[10, 10], [90, 10], [90, 70], [10, 70]]
+
+
+def town() -> BoxMap:
+    """A square of 120 m x 80 m with a house, a low wall across half of it, and a bin."""
+    return map_of(
+        ("Ground", (60, 40, -0.1), (60, 40, 0.1)), ("Buildings", (60, 40, 5), (8, 6, 5), 20.0),
+        ("Walls", (30, 60, 1), (14, 0.3, 1)), ("Static", (100, 20, 0.5), (0.4, 0.4, 0.5)), name="plaza", ground_z_m=0.0,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def map_file(tmp_path) -> Path:
+    write_boxes(tmp_path / "map.json", town())
+    return tmp_path / "map.json"
+
+
+@contextlib.contextmanager
+def serving(map_file: Path, roi: Path) -> Iterator[PageServer]:
+    server = open_editor(map_file, CFG, roi, 0)
+    thread = threading.Thread(target=server.serve)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.http.shutdown()
+        thread.join()
+
+
+def click_at(page: Page, *places: list[float]) -> None:
+    for place in places:
+        page.click(*pixel_of(page, place))
+
+
+def pixel_of(page: Page, place: list[float]) -> tuple[float, float]:
+    x, y = page.run(f"window.editor.map.at({json.dumps(place)})")
+    return x, y  # the board begins at the window's corner
+
+
+def settled(page: Page) -> None:
+    """The cells are those of what is drawn."""
+    for _ in range(2):  # what was changed while it asked is asked for afterwards
+        page.run("new Promise((done) => setTimeout(done, 150))")  # ends after the 100 ms that it waits for more changes
+        page.wait("!document.body.dataset.asks")
+
+
+@pytest.mark.slow
+def test_a_polygon_with_a_hole_is_drawn_saved_and_walked_in(map_file, tmp_path, tab):
+    page, out = tab, tmp_path / "roi_polygon.json"
+    page.said.clear()
+    with serving(map_file, out) as server:
+        page.open(server.address)
+        page.wait("document.body.dataset.ready === 'yes'")
+        click_at(page, *SQUARE)
+        page.run("document.getElementById('close').click()")
+        page.run("document.getElementById('hole').click()")
+        click_at(page, [40, 30], [80, 30], [80, 52], [40, 52])
+        page.run("document.getElementById('close').click()")
+        page.drag(pixel_of(page, [90, 70]), pixel_of(page, [105, 72]))
+        page.drag(pixel_of(page, [60, 20]), pixel_of(page, [50, 25]), "right")
+        page.mouse("mouseWheel", 300, 300, "none", deltaX=0, deltaY=-200)
+        settled(page)
+        page.run("document.getElementById('save').click()")
+        page.wait("document.getElementById('message').className === 'accepted'")
+        roi = read_roi(out)
+        ground = walkable_ground(town(), CFG, roi)
+        found = np.array(page.run("[...window.editor.marks()]"), dtype=np.uint8).reshape(ground.walkable.shape)[::-1]
+        assert page.run("document.getElementById('figure-used').textContent") == f"{ground.counts['cells_used']:,}"
+        assert not page.said
+    [polygon] = roi.rings()
+    assert np.allclose(polygon.points_world, [[10, 10], [90, 10], [105, 72], [10, 70]], atol=0.2)
+    assert np.allclose(polygon.holes, [[[40, 30], [80, 30], [80, 52], [40, 52]]], atol=0.2)
+    assert ((found > 0) == roi_mask(ground.grid, roi)).all()
+    assert ((found == found.max()) == ground.walkable).all()
+    settings = [f"--set pedestrians.{name}={getattr(CFG, name)}" for name in CFG.model_fields_set]
+    obeyed(f"pedestrians --map {map_file} --roi {out} --out {tmp_path / 'walks'} --workers 1", " ".join(settings))
+    for walk in read_paths(tmp_path / "walks/path.json"):
+        x, y = ground.grid.cells_at(walk.polyline_m).T
+        assert ground.is_in_roi[y, x].all()
+
+
+def asked(server: PageServer, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection(server.host, timeout=60)
+    own = {"Origin": f"http://{server.host}"} | headers
+    connection.request(method, path, body, own)
+    reply = connection.getresponse()
+    return reply.status, reply.read()
+
+
+def test_only_our_own_page_is_answered(map_file, tmp_path):
+    out = tmp_path / "roi.json"
+    body = json.dumps({"points_world": SQUARE}).encode()
+    with serving(map_file, out) as server:
+        ours = f"/{server.token}/"
+        assert server.host.startswith("127.0.0.1:")
+        assert asked(server, "GET", ours)[0] == 200
+        for path in (
+            "/", "/save", f"/{server.token}x/", f"/{server.token[:-1]}/", "/../../etc/passwd",
+            f"{ours}../../etc/passwd", f"{ours}save",
+        ):  # fmt: skip
+            assert asked(server, "GET", path)[0] == 404, path
+        assert asked(server, "GET", ours, Host="evil.example")[0] == 404
+        assert asked(server, "POST", f"{ours}save", body, Origin="http://evil.example")[0] == 404
+        assert asked(server, "POST", "/x/save", body)[0] == 404
+        assert asked(server, "POST", f"{ours}save/../../x.json", body)[0] == 404
+        assert not out.exists()
+        assert b"too large" in asked(server, "POST", f"{ours}cells", **{"Content-Length": "99999999999"})[1]
+        assert asked(server, "POST", f"{ours}save", body)[0] == 200
+        assert read_roi(out).points_world == [(10, 10), (90, 10), (90, 70), (10, 70)]
+        out.write_text(json.dumps({"points_world": SQUARE[:3]}))
+        status, said = asked(server, "POST", f"{ours}save", body)
+        assert (status, b"another program changed the file" in said) == (400, True)
+        assert len(read_roi(out).points_world) == 3

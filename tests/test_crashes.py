@@ -6,7 +6,6 @@ import contextlib
 import itertools
 import re
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +14,7 @@ import pytest
 from commands import invoke, obeyed, working_here
 from crash_sweep import COMMANDS
 from crashes import called_complete, sweep
+from processes import ran
 from specimens_release import SMALL_RUN
 from test_docs import COMMANDS as DOCUMENTED
 from toy_workers import stage_in
@@ -94,9 +94,7 @@ def test_a_product_without_its_records_that_another_stage_would_take_is_found(tm
 ])  # fmt: skip
 @pytest.mark.slow
 def test_killed_commands_go_on(asked):
-    done = subprocess.run([sys.executable, SWEEP, *asked], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.count(" 0 wrong") == sum(name in COMMANDS for name in asked)
+    assert ran(sys.executable, SWEEP, *asked).stdout.count(" 0 wrong") == sum(name in COMMANDS for name in asked)
 
 
 def test_every_command_that_writes_is_in_the_sweep():

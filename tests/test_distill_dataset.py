@@ -240,10 +240,6 @@ def samples(windows_of_tracks: Path) -> dict[str, list[TrackSample]]:
     return {split: [TrackSample(**row) for row in rows_of(split_path(windows_of_tracks, split))] for split in SPLITS}
 
 
-def run(four_walks: Path, out: Path, **settings: object) -> Path:
-    return dual_track.run(DualTrackConfig.model_validate(settings), [four_walks], out)
-
-
 def test_the_papers_windows():
     """Windows of 10 frames, one every 3: (N - 10) / 3 + 1, which the paper calls 50 to 60 of 170 to 200 frames."""
     for num_frames, expected in [(9, []), (10, [0]), (12, [0]), (13, [0, 3]), (170, 54), (200, 64)]:
@@ -283,7 +279,7 @@ def test_a_bad_flight_stops_no_other(tmp_path, four_walks):
     raw["points"] = raw["points"][:20]
     raw["points"][-1]["nav_waypoint"]["t1_world"] = None
     (flights[2] / "trajectory.json").write_text(json.dumps(raw))
-    out = run(own_tree, tmp_path / "set")
+    out = dual_track.run(DualTrackConfig(), [own_tree], tmp_path / "set")
     counts = read_manifest(out).counts
     assert (counts.input, counts.kept) == (4, 1)
     assert counts.dropped == {"no_clean_flight": 1, "clean_flight_of_other_frames": 1}

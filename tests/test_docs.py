@@ -1,8 +1,10 @@
-"""The documents are true: every command has help and stands in the README, and what they name exists."""
+"""The documents are true: every command has help and stands in the README, and what they name exists.
+
+Banned words stay out of code, messages and documents.
+"""
 
 import re
 import shlex
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -12,6 +14,7 @@ from typing import Any
 import pytest
 import typer
 import yaml
+from processes import ran
 from pydantic import BaseModel
 
 import cosfly
@@ -124,13 +127,8 @@ def test_every_file_of_the_files_page_is_written_by_code():
 
 def test_the_site_is_built_without_a_warning(tmp_path):
     pytest.importorskip("mkdocs")
-    words = [
-        sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-f", str(ROOT / "mkdocs.yml"), "-d",
-        str(tmp_path / "site"),
-    ]  # fmt: skip
-    done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+    words = f"-m mkdocs build --strict -q -f {ROOT / 'mkdocs.yml'} -d {tmp_path / 'site'}"
+    assert ran(sys.executable, *words.split(), cwd=tmp_path).stderr == ""
     assert {f"{page.stem}.html" for page in (ROOT / "docs").rglob("*.md")} <= {
         p.name for p in (tmp_path / "site").rglob("*.html")
     }
@@ -188,9 +186,7 @@ def test_one_version_is_named_everywhere_and_every_tag_has_its_heading():
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))["version"]
     assert found[0][0] == cosfly.__version__ == pyproject == citation
-    tags = subprocess.run(
-        ["git", "tag", "--list", "v*"], cwd=ROOT, capture_output=True, text=True, check=False
-    ).stdout.split()
+    tags = ran("git", "tag", "--list", "v*", cwd=ROOT).stdout.split()
     assert set(tags) <= {f"v{number}" for number, day in found if day != "unreleased"}
 
 
@@ -228,7 +224,7 @@ def typed_commands(page: Path) -> list[str]:
 
 
 COMMAND_LINE = typer.main.get_command(app)
-# The commands of extending.md need its examples: tests/test_docs_examples.py runs them.
+# The commands of extending.md need its examples: tests/test_docs_run.py runs them.
 ALL = [(page.name, text) for page in PAGES if page.name != "extending.md" for text in typed_commands(page)]
 
 
@@ -256,3 +252,23 @@ def test_no_option_in_running_text_is_unknown():
             known = {option for parameter in command.params for option in parameter.opts} | {"--help", "--version"}
             unknown += [f"{page.name}: cosfly {text}" for word in words if word.startswith("-") and word not in known]
     assert not unknown
+
+
+USER_WORDS = "cosfly/worldgen/words.yaml"  # the words of prompts
+BANNED = re.compile(
+    r"\b(anew|beside|whither|mend(s|ed|ing)?|look-alikes?|sign of life|of before|gone on with|taken up|left out|"
+    r"that which|is told|are told|was told|is borne out|are borne out|stands? in for|who answers|what is said)\b",
+    re.IGNORECASE,
+)
+
+
+def test_banned_words_are_not_used():
+    wrong = [
+        f"{name}:{number}: {match[0]}"
+        for name in ran("git", "ls-files", cwd=ROOT).stdout.splitlines()
+        if name.endswith((".py", ".md", ".html", ".js", ".yaml", ".css", "Makefile"))
+        if name != USER_WORDS and not name.startswith("tests/")
+        for number, line in enumerate((ROOT / name).read_text(encoding="utf-8").splitlines(), 1)
+        for match in BANNED.finditer(line)
+    ]
+    assert wrong == []

@@ -1,11 +1,16 @@
-"""Every command of the documentation runs, page after page in one folder, as somebody would who reads along."""
+"""Every command of the documentation runs, page after page in one folder, as somebody would who reads along.
+
+The examples of docs/extending.md work in a copy of the sources, and so do the cells of the notebook.
+"""
 
 import glob
 import gzip
 import json
+import os
 import re
 import shlex
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -14,14 +19,15 @@ from typing import Any
 
 import pytest
 import yaml
+from processes import ran
 from simulator_serving import serving
 from specimens_foreign import write_foreign_tree
-from specimens_slopes import sloped_city
 from teacher_server import TeacherServer
 from test_caption_servers import patient
+from test_cosfly_derived_ground import sloped_city
 from test_cosfly_map_kinds import node, write_world
 from test_distill_evaluate import make_encoder
-from test_docs import ALL, PAGES, blocks
+from test_docs import ALL, PAGES, ROOT, blocks
 from typer.testing import CliRunner
 
 from cosfly.cli import app
@@ -37,8 +43,7 @@ QUICKSTART = "run quickstart --out runs/quickstart"  # what `make quickstart` do
 # What no machine of the tests can do, or another test does: words of the command, and why.
 NOT_HERE = {
     "vllm serve ": "a server of real weights, on an accelerator; the teacher's server of the tests stands in for it",
-    "torchrun --nproc-per-node 8": "eight accelerators; the command runs here in one process, and in two in "
-    "tests/test_distill_train_ranks.py",
+    "torchrun --nproc-per-node 8": "eight accelerators; here one process, in tests/test_distill_train.py two",
     "make quickstart": "it installs first; what it runs then is QUICKSTART",
     "make test": "that is this",
     "pip install -e": "the tests stand in that environment",
@@ -46,8 +51,8 @@ NOT_HERE = {
     "python tests/benchmarks/": "minutes each; what they measure stands beside them in the documents",
     "--env cosfly/": "1,600 frames each; tests/test_cosfly_envs.py flies a list and policies",
     "--out work/round1": "two short flights are too few walks to split; tests/test_distill_dataset.py has more",
-    "roi edit ": "it serves until it is stopped; tests/test_cosfly_roi_editor.py draws on its page",
-    "SmolLM2-135M-Instruct.Q4_1.gguf": "a file of 98 MB; tests/test_distill_families.py trains it where it is",
+    "roi edit ": "it serves until it is stopped; tests/test_cosfly_viz.py draws on its page",
+    "SmolLM2-135M-Instruct.Q4_1.gguf": "a file of 98 MB; tests/test_distill_student.py trains it where it is",
     "--predictions work/infer-cpu": "the answers of that file",
     "http://localhost:11434": "needs Ollama and a model; the commands run with a test server at another port",
     "--teacher vllm:": "vLLM needs an accelerator; tests/test_engines_contract.py holds its engine to the documents",
@@ -166,10 +171,6 @@ def _world(root: Path, target: Path) -> None:
     (target.parent / "world.json").rename(target)
 
 
-def _delft(root: Path, target: Path) -> None:
-    target.write_bytes(gzip.compress(json.dumps(sloped_city()).encode()))
-
-
 def _others_captions(root: Path, target: Path) -> None:
     lines = [
         {"sample_id": c.sample_id, "en": c.en.model_dump(), "zh": c.zh.model_dump()}
@@ -185,7 +186,9 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "town.csv": _shown("install.md", "type,x_m"), "town.geojson": _shown("maps.md", '{"type": "FeatureCollection"'),
     "mine.yaml": _shown("commands.md", "name: mine"),
     "osm.geojson": _tagged, "buildings.geojson": _tagged, "file:captions.jsonl": _others_captions,
-    "progen_world.json": _world, "delft.json.gz": _delft, "work/flown0": copy_of("work/rules"),
+    "progen_world.json": _world,
+    "delft.json.gz": lambda root, target: target.write_bytes(gzip.compress(json.dumps(sloped_city()).encode())),
+    "work/flown0": copy_of("work/rules"),
     "work/flown1": copy_of("work/planner"), "work/copy": copy_of("work/release"),
     "work/unlabelled/render": copy_of("runs/quickstart/render"),
     "Qwen/Qwen3.5-2B": lambda root, target: make_random_student(target),
@@ -238,11 +241,6 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
         yield Place(root, teacher.url, {"2000": carla, "9000": unrealcv})
 
 
-def in_order() -> list[tuple[str, str]]:
-    pages = [*FIRST, *sorted({page for page, _ in ALL} - {*FIRST, *LAST}), *LAST]
-    return [("commands.md", QUICKSTART), *((page, text) for wanted in pages for page, text in ALL if page == wanted)]
-
-
 def test_what_cannot_run_here_is_in_the_documents():
     lines = [" ".join(block.split()) for page in PAGES for block in blocks(page.read_text(encoding="utf-8"))]
     texts = [*lines, *(text for _, text in ALL)]
@@ -260,8 +258,9 @@ def room_on_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(3600)  # 4 minutes on a machine that has nothing else to do
 def test_every_command_runs(place, in_this_process, room_on_the_disk):
-    failed = []
-    for page, text in in_order():
+    failed, pages = [], [*FIRST, *sorted({page for page, _ in ALL} - {*FIRST, *LAST}), *LAST]
+    in_order = [(page, text) for wanted in pages for page, text in ALL if page == wanted]
+    for page, text in [("commands.md", QUICKSTART), *in_order]:
         if any(word in text for word in NOT_HERE):
             continue
         place.make(text)
@@ -272,3 +271,97 @@ def test_every_command_runs(place, in_this_process, room_on_the_disk):
         if result.exit_code:
             failed.append(f"{page}: cosfly {text}\n{result.output[-1500:]}\n{result.exception!r}")
     assert not failed, "\n\n".join(failed)
+
+
+EXTENDING = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
+NOTEBOOK = json.loads((ROOT / "docs/release.ipynb").read_text(encoding="utf-8"))
+CELLS = [cell for cell in NOTEBOOK["cells"] if cell["cell_type"] == "code"]
+NAMED = re.compile(r"^# (\S+\.(?:py|md))$")
+PRODUCTS = (
+    "work/blocks/boxes_3d.json", "work/overhead/drone_trace.json", "work/compared/compare.json",
+    "work/thermal/manifest.json", "work/echo/captions.jsonl", "work/inspect/report.html",
+    "work/altitudes/dataset/release.json", "work/poses/poses/checksums.sha256",
+)  # fmt: skip
+
+
+def examples(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", EXTENDING, re.DOTALL | re.MULTILINE)
+
+
+def edits() -> Iterator[tuple[str, str, str]]:
+    """Yield, for each hunk of the diff blocks, the file, the old and the new text."""
+    for block in examples("diff"):
+        name, hunk = "", list[str]()
+        for line in [*block.splitlines(), "@@"]:
+            found = NAMED.match(line)
+            if found or line == "@@":
+                if hunk:
+                    yield name, *("".join(f"{one[1:]}\n" for one in hunk if one[0] != mark) for mark in "+-")
+                name, hunk = found[1] if found else name, []
+            else:
+                hunk.append(line)
+
+
+def apply_examples(folder: Path) -> None:
+    for block in examples("python"):
+        if name := NAMED.match(block.partition("\n")[0]):
+            assert not (folder / name[1]).exists()
+            (folder / name[1]).write_text(block)
+    for file, old, new in edits():
+        text = (folder / file).read_text()
+        assert text.count(old) == 1, f"{file} has no single place for:\n{old}"
+        (folder / file).write_text(text.replace(old, new))
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    for name in ("cosfly", "caption", "distill", "release", "configs"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return tmp_path
+
+
+def write_quickstart(folder: Path) -> None:
+    """Write a configuration of the name `quickstart`, which `cosfly run` prefers to the shipped one."""
+    small = small_run("quickstart")
+    small["pedestrians"].update(num_paths=1)
+    small["render"].update(width_px=480, height_px=270)  # smaller tracks are illegible, and rejected
+    (folder / "quickstart").write_text(yaml.safe_dump(small))
+
+
+def test_the_edits_of_the_examples_fit_the_sources(clone):
+    apply_examples(clone)
+    assert len(list(edits())) >= 10
+    for file, _, new in edits():
+        assert new in (clone / file).read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)  # 4 minutes on a machine that has nothing else to do: kernels are compiled again
+def test_the_examples_work(clone):
+    apply_examples(clone)
+    write_quickstart(clone)
+    (clone / "bin").mkdir()
+    for name, words in (("cosfly", "-m cosfly"), ("python", "")):
+        (clone / "bin" / name).write_text(f'#!/bin/sh\nexec "{sys.executable}" {words} "$@"\n')
+        (clone / "bin" / name).chmod(0o755)
+    environment = os.environ | {"PATH": f"{clone}/bin:{os.environ['PATH']}", "PYTHONPATH": str(clone)}
+    for block in examples("bash"):
+        ran("bash", "-e", "-c", block, cwd=clone, env=environment)
+    assert [name for name in PRODUCTS if not (clone / name).is_file()] == []
+
+
+def test_every_cell_of_the_notebook_was_run_without_an_error():
+    assert [cell["execution_count"] for cell in CELLS] == list(range(1, len(CELLS) + 1))
+    outputs = [output for cell in CELLS for output in cell["outputs"]]
+    assert not [output for output in outputs if output["output_type"] == "error"]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_the_cells_of_the_notebook_run(tmp_path):
+    write_quickstart(tmp_path)
+    program = "\n\n".join(["import matplotlib", 'matplotlib.use("Agg")', *("".join(cell["source"]) for cell in CELLS)])
+    for words in (["-m", "cosfly", "run", "quickstart", "--out", "runs/quickstart"], ["-c", program]):
+        done = ran(sys.executable, *words, cwd=tmp_path)
+    assert re.search(r"^10 steps, loss \d", done.stdout, re.MULTILINE)

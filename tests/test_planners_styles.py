@@ -1,35 +1,29 @@
 """Styles: what the table says is what is drawn, flown by every planner, and seen in the labels."""
 
 from collections import Counter
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from specimens_planning import WORLDS, assert_safe, town_of, walk_along
+from specimens_planning import WORLDS, assert_safe, town_flights, town_of, track_of, walk_along
 
-from caption.schema import FutureMotion
+from caption.schema import WindowConfig
+from caption.stage.windows import cut_windows
 from caption.verification.actions import TABLE as ACTION_TABLE
 from caption.verification.actions import measure
 from cosfly.formats.captions import TOKENS
 from cosfly.formats.frames import LEGIBLE_HEIGHT_PX, Camera
-from cosfly.formats.pedestrian_paths import paces_of, walk_id
+from cosfly.formats.pedestrian_paths import paces_of
 from cosfly.formats.traces import DroneTrace
 from cosfly.geometry import kernels
 from cosfly.geometry.axes import intrinsic_matrix, look_at, world_from_camera, wrap_deg
-from cosfly.maps.stage import load_map
-from cosfly.pedestrians.stage import make_pedestrian
-from cosfly.pedestrians.walkable import walkable_ground
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.planners.reference_trajectory import finds_again
-from cosfly.planners.stage import draw_styles_of, plan_trajectory, screens_of
+from cosfly.planners.stage import plan_trajectory
 from cosfly.planners.styles import FOLLOW, NAMES, REACQUIRE, RETURN_HOME, TABLE
 from cosfly.render.camera import view_target
 from cosfly.runtime.config import load, shipped
-from cosfly.runtime.errors import NoPathError
-from cosfly.runtime.seeding import rng_for
-from cosfly.simplify.passes import simplify
 
 OPEN = kernels.obstacle_index(town_of())
 STRAIGHT = walk_along("straight", [(0, 0), (90, 0)])
@@ -49,20 +43,8 @@ def styled(name, **more):
 
 def labels_of(trace):
     """The labels of a flight's windows; what the camera does not look at is not seen."""
-    camera = Camera(640, 360, intrinsic_matrix(640, 360, 60.0))
-    poses = zip(trace.positions_m, trace.rotations_deg, trace.targets_m, strict=True)
-    in_view = [view_target(at_m, world_from_camera(place, turn), camera).in_view for place, turn, at_m in poses]
-    visible = (trace.visibility > 0) & np.array(in_view)
-    found = []
-    for now in range(4, len(trace.time_s) - 5):
-        span, before = slice(now, now + 6), trace.positions_m[now] - trace.positions_m[now - 1]
-        future = FutureMotion(
-            tuple(range(now + 1, now + 6)), trace.time_s[span], trace.positions_m[span], trace.rotations_deg[span, 1],
-            trace.targets_m[span], visible[span], float(np.linalg.norm(before)) / 0.5,
-            order=None if trace.mission is None else trace.mission.order_at(now),
-        )  # fmt: skip
-        found.append(ACTION_TABLE.label_of(measure(future)))
-    return Counter(found)
+    windows = cut_windows(track_of(trace, (640, 360), 60.0), WindowConfig(require_images=False))
+    return Counter(ACTION_TABLE.label_of(measure(window.future)) for window in windows)
 
 
 @pytest.mark.parametrize("name", TABLE)
@@ -135,22 +117,6 @@ def test_a_style_that_the_map_does_not_hold_is_dropped_or_followed_and_says_why(
 ORDERS, DECISIONS_LEAST, STYLE_MOST = {"break_off", "return_to_home"}, 0.02, 0.3
 
 
-def flights_of(cfg):
-    for name in cfg.towns:
-        town = cfg.of_town(name)
-        box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify)
-        ground, paces = walkable_ground(box_map, town.pedestrians), paces_of(10, town.pedestrians.pace, town.seed)
-        chances = {walk_id(k): rng_for(town.seed, "pedestrians", walk_id(k)) for k in range(len(paces))}
-        walks = [
-            make_pedestrian(id_, ground, town.pedestrians, rng, pace).trajectory
-            for (id_, rng), pace in zip(chances.items(), paces, strict=True)
-        ]
-        obstacles, screens = kernels.obstacle_index(box_map), screens_of(box_map)
-        for walk, styles in zip(walks, draw_styles_of(walks, town.plan, town.seed), strict=True):
-            with suppress(NoPathError):  # a failure that the stage counts
-                yield plan_trajectory(walk, obstacles, town.plan, town.seed, screens, styles)
-
-
 def heights_px(trace, cfg):
     """Of the target in every tenth frame that has it in view, at each field of view."""
     for fov_deg in cfg.fovs_deg:
@@ -167,7 +133,8 @@ def heights_px(trace, cfg):
 @pytest.mark.parametrize("seed", range(10))
 def test_diverse_shows_each_decision_and_all_heights_and_distances_whatever_the_seed(seed):
     cfg = load(RunConfig, shipped("diverse.yaml"), [f"seed={seed}"])
-    flights = flights_of(cfg)
+    towns = [cfg.of_town(name) for name in cfg.towns]
+    flights = (one for town in towns for one in town_flights(town, paces_of(10, town.pedestrians.pace, town.seed)))
     kept = [trace for trace in flights if trace.drop_reason is None]
     assert len(kept) >= 78
     labels = sum(map(labels_of, kept), Counter())

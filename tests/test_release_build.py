@@ -17,7 +17,17 @@ import pytest
 from PIL import Image
 from release_tampering import errors_in, forge
 from specimens_foreign import write_foreign_tree
-from specimens_release import CFG, FREE, all_bytes, build, make_caption, make_inspection, rewrite_captions, source_of
+from specimens_release import (
+    CFG,
+    FREE,
+    all_bytes,
+    build,
+    make_caption,
+    make_inspection,
+    rewrite_captions,
+    rows_by_id,
+    source_of,
+)
 
 from caption.schema import CaptionConfig
 from caption.stage import stage as caption_stage
@@ -89,11 +99,6 @@ def record_of(material: Path, out: Path, cfg: ReleaseConfig | None = None) -> Re
     return read_record(run(cfg or split_cfg(), [source_of(material)], out) / "release.json")
 
 
-def table_of(folder: Path, columns: list[str]) -> list[dict]:
-    record = read_record(folder / "release.json")
-    return [row for shard in record.shards for row in pq.read_table(folder / shard.path, columns=columns).to_pylist()]
-
-
 def test_splits_share_no_walk_and_no_twins(material, tmp_path):
     record = record_of(material, tmp_path / "r")
     assert {name: len(split.walks) for name, split in record.splits.splits.items()} == {
@@ -105,8 +110,7 @@ def test_splits_share_no_walk_and_no_twins(material, tmp_path):
     for flight in record.flights:
         twin = by_name[flight.pair or ""]
         assert (twin.pair, twin.split, twin.walk) == (flight.flight, flight.split, flight.walk)
-    rows = table_of(tmp_path / "r/dataset", ["run", "town", "trajectory", "variant", "split", "walk", "pair"])
-    for row in rows:
+    for row in rows_by_id(tmp_path / "r/dataset").values():
         entry = by_name["/".join(row[name] for name in ("run", "town", "trajectory", "variant"))]
         assert (row["split"], row["walk"], row["pair"]) == (entry.split, entry.walk, entry.pair)
     for shard in record.shards:
@@ -160,7 +164,7 @@ def test_the_record_says_where_it_comes_from_and_nothing_of_this_machine(copy, t
     for data in all_bytes(tmp_path / "r/dataset").values():
         assert b"/home/somebody" not in data
         assert str(tmp_path).encode() not in data
-    assert {row["teacher_model"] for row in table_of(tmp_path / "r/dataset", ["teacher_model"])} == {"teacher-7", None}
+    assert {row["teacher_model"] for row in rows_by_id(tmp_path / "r/dataset").values()} == {"teacher-7", None}
 
 
 def first_flight(root: Path) -> Path:
@@ -275,7 +279,7 @@ def test_each_shard_that_cannot_be_written_is_named_and_the_finished_ones_are_no
 def test_windows_keep_the_pictures_of_captions(tmp_path):
     make_material(tmp_path, 1, num_points=100, captioned=range(4, 90))
     folder = run(split_cfg(num_frames=60, selection="windows"), [source_of(tmp_path)], tmp_path / "r")
-    rows = table_of(folder, ["variant", "frame_index", "caption_window", "has_caption"])
+    rows = list(rows_by_id(folder).values())
     for variant in ("ORI", "aug_001"):
         own = [row for row in rows if row["variant"] == variant]
         frames = {row["frame_index"] for row in own}

@@ -1,14 +1,11 @@
 """Captions as conversations; exports of what has nothing to export, and onto a full disk."""
 
 import json
-import resource
 import shutil
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from processes import full_disk
 from specimens_release import CFG, DROPPED, build, release_of
 
 from cosfly.formats.captions import Caption, Coc, read_captions
@@ -123,9 +120,6 @@ def test_a_training_set_is_not_made_of_a_release(run):
         RunSource.of_run(run / "release")
 
 
-DISK_BYTES = 1_000  # the largest file that the system permits
-
-
 @pytest.mark.parametrize("format", ["chat", "sharegpt"])
 def test_a_release_without_captions_is_refused(tmp_path, format):
     make_playback_tree(tmp_path / "tree", 1, 4, width_px=96, height_px=54)  # too short for a window
@@ -144,22 +138,10 @@ def test_what_is_not_a_release_is_refused(two_splits, tmp_path, format):
     assert not (tmp_path / "out").exists()
 
 
-@contextmanager
-def full_disk() -> Iterator[None]:
-    """Limit the size of files: the system cuts the write that exceeds it, as on a full disk."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (DISK_BYTES, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-
-
 @pytest.mark.parametrize("format", EXPORTS)
-def test_a_full_disk_leaves_nothing_half_written(two_splits, tmp_path, format, monkeypatch):
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # a module imported now would be cut in __pycache__
+def test_a_full_disk_leaves_nothing_half_written(two_splits, tmp_path, format):
     out = tmp_path / "out"
-    with full_disk(), pytest.raises(StorageError, match="the file cannot be written"):
+    with full_disk(1_000), pytest.raises(StorageError, match="the file cannot be written"):
         exported(two_splits, out, format)
     assert not (out / format).exists()
     assert list(out.rglob("*.partial")) == []

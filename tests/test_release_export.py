@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from filelock import FileLock
+from processes import ran
 from public_reader import read_public
 from release_tampering import rewrite
 from specimens_release import all_bytes, make_release, rows_by_id
@@ -80,18 +81,6 @@ def config(format: str, **more) -> ExportConfig:
     return build_config(ExportConfig, {"format": format, "shard_mb": 1, **more}, "test")
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("whole")
-    make_release(root)
-    return root
-
-
-@pytest.fixture(scope="module")
-def dataset(whole) -> Path:
-    return whole / "release" / "dataset"
-
-
 def assert_same_flight(found: Path, given: Path) -> None:
     a, b = read_track(given), read_track(found)
     records = (a, b), (a.target, b.target), (a.perturbation, b.perturbation)
@@ -110,25 +99,25 @@ def assert_same_flight(found: Path, given: Path) -> None:
             assert (a.frame_folder(i) / name).read_bytes() == (b.frame_folder(i) / name).read_bytes()
 
 
-def test_tree_to_release_to_tree_loses_nothing(whole, dataset, tmp_path):
-    product = export(config("tree"), dataset, tmp_path / "out")
-    given = find_tracks(whole / "tree")
+def test_tree_to_release_to_tree_loses_nothing(two_splits, tmp_path):
+    product, tree = export(config("tree"), two_splits, tmp_path / "out"), two_splits.parents[1] / "tree"
+    given = find_tracks(tree)
     found = find_tracks(product)
-    assert [p.relative_to(product) for p in found] == [p.relative_to(whole / "tree") for p in given]
+    assert [p.relative_to(product) for p in found] == [p.relative_to(tree) for p in given]
     for a, b in zip(given, found, strict=True):
         assert_same_flight(b, a)
         assert read_checksums(b) == {
             p.relative_to(b).as_posix(): sha256_file(p) for p in b.rglob("*") if p.is_file() and p.name != CHECKSUMS
         }
     assert len(read_public(product, exported=True)) == 3  # the strictest public reader
-    assert read_town_map(product / "Town01").licence == read_record(dataset / "release.json").maps[0].licence
+    assert read_town_map(product / "Town01").licence == read_record(two_splits / "release.json").maps[0].licence
 
 
-def test_webdataset_opens_it(dataset, tmp_path):
+def test_webdataset_opens_it(two_splits, tmp_path):
     """Both libraries, whose first rows have no caption, find every value of the release."""
     datasets, wds = pytest.importorskip("datasets"), pytest.importorskip("webdataset", reason="extra dev")
-    product = export(config("webdataset"), dataset, tmp_path / "out")
-    shards, rows = sorted(str(path) for path in product.glob("*.tar")), rows_by_id(dataset)
+    product = export(config("webdataset"), two_splits, tmp_path / "out")
+    shards, rows = sorted(str(path) for path in product.glob("*.tar")), rows_by_id(two_splits)
     with tarfile.open(shards[0]) as tar:
         assert all(member.mtime == 0 and member.uid == 0 for member in tar)
     samples = list(wds.WebDataset(shards, shardshuffle=False).decode("rgb8"))
@@ -153,15 +142,15 @@ def test_webdataset_opens_it(dataset, tmp_path):
                     assert found_numbers.tolist() == (numbers if isinstance(numbers, list) else [numbers])
 
 
-def test_coco_opens_it(dataset, tmp_path):
+def test_coco_opens_it(two_splits, tmp_path):
     """pycocotools finds the pixels of instance.png, and the target by its id."""
     coco_api = pytest.importorskip("pycocotools.coco", reason="extra dev")
-    product = export(config("coco"), dataset, tmp_path / "out")
-    coco, rows = coco_api.COCO(product / "annotations/instances_train.json"), rows_by_id(dataset)
-    assert len(coco.imgs) == len(rows)
-    for image in coco.imgs.values():
-        row = rows[image["file_name"].removesuffix(".png")]
-        assert (product / "train" / image["file_name"]).read_bytes() == row["image"]["bytes"]
+    product, rows = export(config("coco"), two_splits, tmp_path / "out"), rows_by_id(two_splits)
+    files = {split: coco_api.COCO(product / f"annotations/instances_{split}.json") for split in ("train", "validation")}
+    assert sum(len(coco.imgs) for coco in files.values()) == len(rows)
+    for split, image in [(split, image) for split, one in files.items() for image in one.imgs.values()]:
+        coco, row = files[split], rows[image["file_name"].removesuffix(".png")]
+        assert (product / split / image["file_name"]).read_bytes() == row["image"]["bytes"]
         red, green, blue = np.moveaxis(colours_of(row["instance"]["bytes"], "x").astype(int), 2, 0)
         ids = np.where(red == 12, green + 256 * blue, -1)
         annotations = coco.loadAnns(coco.getAnnIds(image["id"]))
@@ -213,14 +202,14 @@ def test_splits_reach_every_format(two_splits, tmp_path):
 
 
 @pytest.mark.parametrize("format", EXPORTS)
-def test_an_export_has_the_same_bytes_again_lists_all_and_says_where_it_came_from(format, dataset, tmp_path):
-    one, two = (export(config(format), dataset, tmp_path / name) for name in ("one", "two"))
+def test_an_export_has_the_same_bytes_again_lists_all_and_says_where_it_came_from(format, two_splits, tmp_path):
+    one, two = (export(config(format), two_splits, tmp_path / name) for name in ("one", "two"))
     assert all_bytes(one) == all_bytes(two)
     listed = read_checksums(one)
     assert all(sha256_file(one / name) == digest for name, digest in listed.items())
     unlisted = set(all_bytes(one)) - set(listed) - {"README.md", CHECKSUMS}
     assert not unlisted or format == "tree"  # whose flights have lists of their own
-    source, readme = open_release(dataset), (one / "README.md").read_text()
+    source, readme = open_release(two_splits), (one / "README.md").read_text()
     assert source.record.content_digest in readme
     assert f"\n{sum(map(len, source.tracks()))} frames of {source.record.name}" in readme
     assert "license: cc-by-4.0" in readme
@@ -230,8 +219,8 @@ def test_an_export_has_the_same_bytes_again_lists_all_and_says_where_it_came_fro
 
 
 @pytest.fixture
-def broken(dataset, tmp_path) -> Path:
-    return shutil.copytree(dataset, tmp_path / "broken")
+def broken(two_splits, tmp_path) -> Path:
+    return shutil.copytree(two_splits, tmp_path / "broken")
 
 
 @pytest.mark.parametrize(
@@ -277,31 +266,26 @@ def sha256(array: np.ndarray) -> str:
 def look(product: Path, home: Path, *indices: int) -> dict:
     """Return what LeRobot itself sees."""
     reader = Path(__file__).with_name("read_lerobot.py")
-    done = subprocess.run(
-        [str(lerobot_python()), str(reader), str(product), *map(str, indices)],
-        capture_output=True, text=True, check=False, env={"HF_HOME": str(home), "PATH": "/usr/bin:/bin"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-3000:]
+    done = ran(lerobot_python(), reader, product, *indices, env={"HF_HOME": str(home), "PATH": "/usr/bin:/bin"})
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("LOOK ")]
     return json.loads(line.removeprefix("LOOK "))
 
 
 @pytest.mark.parametrize("video", [False, True])
-def test_lerobot_has_our_constants_and_reads_pictures_and_videos(dataset, tmp_path, video):
+def test_lerobot_has_our_constants_and_reads_pictures_and_videos(two_splits, tmp_path, video):
     """PyAV is in its environment."""
     script = "from cosfly.__main__ import main; main()"
-    options = ["--format", "lerobot", "--out", str(tmp_path / "out"), *(["--video"] if video else [])]
-    command = [str(lerobot_python()), "-c", script, "release", "export", str(dataset), *options]
+    options = ["--format", "lerobot", "--out", tmp_path / "out", *(["--video"] if video else [])]
     root = Path(__file__).parents[1]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
-    assert done.returncode == 0, done.stderr[-3000:]
+    ran(lerobot_python(), "-c", script, "release", "export", two_splits, *options, cwd=root)
     seen = look(tmp_path / "out/lerobot", tmp_path / "hf")
     assert seen.pop("picture") == [3, 54, 96]
     assert seen == {
         "version": VERSION, "chunk": CHUNK, "data": DATA_PATH, "episodes": EPISODES_PATH, "video": VIDEO_PATH,
         "defaults": sorted(DEFAULTS),
     }  # fmt: skip
-    assert len(list((tmp_path / "out/lerobot").glob("videos/observation.images.rgb/*/*.mp4"))) == video
+    files = list((tmp_path / "out/lerobot").glob("videos/observation.images.rgb/*/*.mp4"))
+    assert len(files) == 2 * video  # one of each split
 
 
 def test_lerobot_opens_it(tmp_path):

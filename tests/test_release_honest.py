@@ -24,7 +24,6 @@ from simulator_serving import serving
 from teacher_server import TeacherServer
 
 from caption.stage.released import read_released
-from cosfly.formats.boxes import BoxMap
 from cosfly.formats.captions import write_captions
 from cosfly.maps import synthetic
 from cosfly.pipeline import run as pipeline
@@ -133,17 +132,13 @@ def work(stages: list[pipeline.Stage]) -> None:
             stage.work()
 
 
-def far_town() -> BoxMap:
-    town = synthetic.load(synthetic.SyntheticConfig(), 0)
-    return replace(town, centers=town.centers + np.array([4000.137, -3000.291, 0.0]))
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Iterator[Callable[[str], Path]]:
     """Return a function that makes the release of a kind once."""
     if not SHARED_DATA.is_dir():
         pytest.skip(f"the real maps are not here: {SHARED_DATA}")
-    town, root = far_town(), tmp_path_factory.mktemp("honest")
+    town, root = synthetic.load(synthetic.SyntheticConfig(), 0), tmp_path_factory.mktemp("honest")
+    town = replace(town, centers=town.centers + np.array([4000.137, -3000.291, 0.0]))
     names = {"DATA": str(SHARED_DATA)}
 
     def settings(map_name: str, told: list[str]) -> RunConfig:

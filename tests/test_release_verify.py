@@ -14,7 +14,6 @@ from commands import invoke
 from release_lies import LIES, at, captioned, change, everything, put
 from release_tampering import depth_of, errors_in, forge, rewrite, set_depth
 from specimens_foreign import hub_snapshot
-from specimens_png import png_around
 
 from caption.stage.released import read_released
 from cosfly.runtime.errors import InputError
@@ -26,6 +25,7 @@ from release.build.sources import Source
 from release.columns import INTRINSICS
 from release.rules import split_flights
 from release.verify.verify import verify
+from specimens import png_around
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ import hashlib
 import json
 import random
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,7 +37,6 @@ from specimens import change_json, make_flight
 
 LEVELS = (110.0, 90.0, 60.0, 30.0)
 SMALL = {"width_px": 160, "height_px": 90, "town": "Street", "first_timestamp": 1776000000}
-DYNAMIC = {"mode": "dynamic", "part_s": 2.0, "ramp_s": 1.0}
 
 
 def test_a_flight_goes_from_level_to_level():
@@ -82,16 +80,9 @@ def test_the_cameras_of_a_flight_survive_the_file(tmp_path):
     assert read_track(folder).intrinsics is None
 
 
-@pytest.fixture(scope="module")
-def zoomed_tree(tmp_path_factory) -> tuple[Path, list[Path]]:
-    folder = tmp_path_factory.mktemp("zoomed")
-    inputs = write_inputs(folder / "inputs", [circling(16)])
-    cfg = RenderConfig.model_validate({**SMALL, "zoom": DYNAMIC})
-    return run(cfg, *inputs, folder / "render", seed=2), inputs
-
-
-def test_every_frame_tells_the_camera_it_was_drawn_with(zoomed_tree):
-    tree, _ = zoomed_tree
+def test_every_frame_tells_the_camera_it_was_drawn_with(tmp_path):
+    cfg = RenderConfig.model_validate({**SMALL, "zoom": {"mode": "dynamic", "part_s": 2.0, "ramp_s": 1.0}})
+    tree = run(cfg, *write_inputs(tmp_path / "inputs", [circling(16)]), tmp_path / "render", seed=2)
     flights = [read_track(folder) for folder in find_tracks(tree)]
     clean, shaken = flights
     np.testing.assert_array_equal(clean.intrinsics, shaken.intrinsics)
@@ -223,20 +214,14 @@ def test_labels_never_change_and_every_pair_of_presets_is_another_picture(render
     np.testing.assert_array_equal(drawn(renderer, params("heavy_rain", "night")).rgb, pictures["heavy_rain", "night"])
 
 
-@pytest.fixture(scope="module")
-def trees(tmp_path_factory):
-    """Three flights of both tracks: without weather, and drawn by seed; and the folder of their inputs."""
-    folder = tmp_path_factory.mktemp("weather")
-    inputs = write_inputs(folder / "in", [circling(3, f"path_{k:03d}") for k in range(3)])
-    return [
-        run(config(**SMALL, fovs_deg=[60.0], **settings), *inputs, folder / name, seed=5)
-        for name, settings in (("off", {}), ("random", RANDOM))
-    ], inputs
-
-
 @pytest.mark.slow
-def test_records_stand_in_every_file_and_labels_are_those_of_fair_weather(trees):
-    (off, drawn_tree), _ = trees
+def test_records_stand_in_every_file_and_labels_are_those_of_fair_weather(tmp_path):
+    """Three flights of both tracks: without weather, and drawn by seed."""
+    inputs = write_inputs(tmp_path / "in", [circling(3, f"path_{k:03d}") for k in range(3)])
+    off, drawn_tree = (
+        run(config(**SMALL, fovs_deg=[60.0], **settings), *inputs, tmp_path / name, seed=5)
+        for name, settings in (("off", {}), ("random", RANDOM))
+    )
     cfg = config(**RANDOM)
     for folder in find_tracks(off):
         plain, flight = read_track(folder), read_track(drawn_tree / folder.relative_to(off))

@@ -9,80 +9,31 @@ Shares are in percent. The target counts as visible where a ray of five reaches 
 """
 
 import argparse
-import sys
-from collections.abc import Iterator
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import scenes  # noqa: F401  # finds the specimens
+from specimens_planning import town_flights, track_of
 
 from caption.schema import WindowConfig
 from caption.stage.windows import cut_windows, order_comes_within
 from caption.verification.actions import TABLE, measure
 from cosfly.formats.captions import TOKENS
-from cosfly.formats.frames import Camera
-from cosfly.formats.pedestrian_paths import walk_id
-from cosfly.formats.playback import Perturbation, TargetRecord, Track
-from cosfly.formats.traces import DroneTrace
-from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
-from cosfly.geometry.kernels import obstacle_index
 from cosfly.inspection.blind_baseline import FITTED_ON, fit_deciders, past_of
-from cosfly.maps.stage import load_map
-from cosfly.pedestrians.stage import make_pedestrian
-from cosfly.pedestrians.walkable import walkable_ground
 from cosfly.pipeline.settings import RunConfig
-from cosfly.planners.stage import draw_styles_of, plan_trajectory, screens_of
-from cosfly.render.camera import view_target
 from cosfly.runtime.config import load, shipped
 from cosfly.runtime.seeding import rng_for
-from cosfly.simplify.passes import simplify
-from specimens import make_flight
 
 UNSEEN = ("old_town", "market")
 SIZE_PX, FOV_DEG = (640, 360), 50.0
-
-
-def traces_of(cfg: RunConfig, name: str) -> Iterator[DroneTrace]:
-    town = cfg.of_town(name)
-    box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify)
-    ground, ids = walkable_ground(box_map, town.pedestrians), map(walk_id, range(town.pedestrians.num_paths))
-    walks = [
-        make_pedestrian(id_, ground, town.pedestrians, rng_for(town.seed, "pedestrians", id_)).trajectory for id_ in ids
-    ]
-    obstacles, screens = obstacle_index(box_map), screens_of(box_map)
-    for walk, styles in zip(walks, draw_styles_of(walks, town.plan, town.seed), strict=True):
-        trace = plan_trajectory(walk, obstacles, town.plan, town.seed, screens, styles)
-        if trace.drop_reason is None:
-            yield trace
-
-
-def track_of(trace: DroneTrace) -> Track:
-    """Return the clean track of a trajectory."""
-    camera = Camera(*SIZE_PX, intrinsic_matrix(*SIZE_PX, FOV_DEG))
-    matrices = [world_from_camera(*pose) for pose in zip(trace.positions_m, trace.rotations_deg, strict=True)]
-    views = [view_target(at_m, pose, camera) for at_m, pose in zip(trace.targets_m, matrices, strict=True)]
-    in_view = np.array([view.in_view for view in views])
-    target = TargetRecord(
-        in_view=in_view, visible=in_view & (trace.visibility > 0), depth_m=np.array([view.depth_m for view in views]),
-        uv=np.array([view.uv for view in views]), bbox=np.array([view.bbox_px for view in views]),
-        visibility=trace.visibility,
-    )  # fmt: skip
-    zero = np.zeros((len(trace.time_s), 3))
-    return replace(
-        make_flight(len(trace.time_s))[0], folder=Path(), camera=camera, time_s=trace.time_s,
-        positions_m=trace.positions_m, rotations_deg=trace.rotations_deg, targets_m=trace.targets_m, target=target,
-        perturbation=Perturbation(np.zeros(len(zero), dtype=bool), zero, zero, zero), segments=trace.segments,
-        mission=trace.mission,
-    )  # fmt: skip
 
 
 def windows_of(cfg: RunConfig, names: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Return the pasts, (n, d), and the labels, (n,), of all windows that have a label."""
     cut, numbers = WindowConfig(), {name: k for k, name in enumerate(TOKENS)}
     found = []
-    for track in (track_of(trace) for name in names for trace in traces_of(cfg, name)):
+    towns = [cfg.of_town(name) for name in names]
+    traces = [trace for town in towns for trace in town_flights(town, [None] * town.pedestrians.num_paths)]
+    for track in (track_of(trace, SIZE_PX, FOV_DEG) for trace in traces if trace.drop_reason is None):
         for window in cut_windows(track, cut):
             now = window.observed.indices[-1]
             label = TABLE.label_of(measure(window.future))

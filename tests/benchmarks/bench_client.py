@@ -9,7 +9,6 @@ import asyncio
 import json
 import multiprocessing
 import shutil
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -17,9 +16,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+import scenes  # noqa: F401  # finds the specimens
 from specimens_captions import VOCABULARY
 from teacher_server import CHINESE, ENGLISH, kept_answers
 
@@ -48,7 +45,9 @@ def main() -> None:
     folder = Path(tempfile.mkdtemp(prefix="bench_client_"))
     try:
         tree = _make_tree(folder / "tree", args.windows)
-        cfg = _settings(url, args.concurrency)
+        endpoint = {"concurrency": args.concurrency, "model": "bench"}
+        settings = {"teacher": url, "endpoint": endpoint, "repair": {"hard_conflict": "keep"}}
+        cfg = CaptionConfig.model_validate(settings)
         # First run: pictures on the way, cold. Second: another folder, the same pictures already encoded.
         encoded: dict[tuple, list] = {}
         rates = [_client(cfg, tree, folder / name, encoded) for name in ("cold", "warm")]
@@ -57,12 +56,6 @@ def main() -> None:
         shutil.rmtree(folder)
     for name, rate in zip(("encoded on the way", "encoded before"), rates, strict=True):
         print(f"pictures {name:<20} {rate:7.1f} requests/s")
-
-
-def _settings(url: str, concurrency: int) -> CaptionConfig:
-    endpoint = {"concurrency": concurrency, "model": "bench"}
-    repair = {"hard_conflict": "keep"}
-    return CaptionConfig.model_validate({"teacher": url, "endpoint": endpoint, "repair": repair})
 
 
 def _client(cfg: CaptionConfig, tree: Path, out: Path, encoded: dict[tuple, list]) -> float:

@@ -3,16 +3,13 @@
 `python tests/benchmarks/bench_pages.py`: a minute. WebGL is drawn by the processor there.
 """
 
-import sys
 import tempfile
 import threading
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
+import scenes
 from browser import Page, browser
-from census_town import census_town
 
 from cosfly.formats.boxes import write_boxes
 from cosfly.pedestrians.roi_editor import open_editor
@@ -35,7 +32,7 @@ def opened_s(page: Page, address: Path | str) -> float:
 
 
 def main() -> None:
-    box_map = census_town("Town", 0)
+    box_map = scenes.town()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         root = Path(name)
         write_boxes(root / "map.json", box_map)

@@ -4,7 +4,6 @@ python tests/benchmarks/bench_planning.py [--maps a b] [--planners muco ...]
 """
 
 import argparse
-import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +11,6 @@ from typing import Any
 
 import numpy as np
 import scenes
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from specimens_planning import solved_by_scipy
 
 from cosfly.formats.boxes import BoxMap, write_boxes

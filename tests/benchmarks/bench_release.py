@@ -12,9 +12,7 @@ import argparse
 import dataclasses
 import hashlib
 import os
-import resource
 import shutil
-import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -22,9 +20,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+import scenes  # noqa: F401  # finds the specimens
 from specimens_distill import make_captions
 
 from cosfly.formats.frames import FILE_NAMES, FrameFile, depth_bytes, frame_name, instance_bytes, rgb_bytes
@@ -81,11 +77,6 @@ def _paint_files(folder: Path, flight: Track, scene: Scene, i: int) -> Path:
     return folder
 
 
-def cpu_seconds() -> float:
-    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
-
-
 def build(root: Path, out: Path) -> tuple[float, int]:
     cfg = ReleaseConfig(licence="cc0-1.0", modalities=STORED, num_frames=FRAMES_RELEASED)
     start_s = time.perf_counter()
@@ -119,15 +110,13 @@ def copy(tree: Path, out: Path) -> tuple[float, int]:
 
 def measure_speed(num_frames: int, folder: Path, rounds: int) -> None:
     tree, out = make_tree(folder, num_frames), folder / "out"
-    print(f"{'':10}{'seconds':>9}{'CPU s':>9}{'MB':>9}{'MB/s':>9}{'frames/s':>10}")
     shares = []  # of the copy's rate
     for number in range(rounds):
         rates = {}
         for name in ("copy", "build")[:: -1 if number % 2 else 1]:  # none always has the quieter disk
-            cpu_s = cpu_seconds()
             seconds, stored = copy(tree, out) if name == "copy" else build(folder, out)
-            used_s, rates[name], pace = cpu_seconds() - cpu_s, stored / seconds / MB, num_frames / seconds
-            print(f"{name:10}{seconds:9.2f}{used_s:9.2f}{stored / MB:9.0f}{rates[name]:9.0f}{pace:10.0f}")
+            rates[name] = stored / seconds / MB
+            print(f"{name}: {num_frames} frames in {seconds:.2f} s, {rates[name]:.0f} MB/s")
             shutil.rmtree(out)
             os.sync()
         shares.append(rates["build"] / rates["copy"])

@@ -1,6 +1,7 @@
 """What the benchmarks measure on, and how: three maps, walks over them, CPU times, tables. Writes nothing into the
 repository."""
 
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ from cosfly.runtime.config import build
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import SimplifyConfig, simplify
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # specimens and servers of the tests, for who imports this
 SHARED_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 NUM_WALKS, SEED = 20, 0
 CITY_GAP_M = 20.0  # between the tiles of a larger map

@@ -17,7 +17,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scenes  # noqa: F401  # finds the specimens
 import torch
+from specimens_families import CHATML
 from torch.nn import functional
 from transformers import (
     AutoModelForCausalLM,
@@ -37,12 +39,7 @@ GRID = SIDE_PX // PATCH_PX
 VISION = {"hidden_size": 384, "intermediate_size": 1536, "num_hidden_layers": 8, "num_attention_heads": 6,
     "image_size": SIDE_PX, "patch_size": PATCH_PX}  # fmt: skip
 IMAGE, FAKE, GLOBAL, END = "<image>", "<fake_token_around_image>", "<global-img>", "<|im_end|>"
-TEMPLATE = (
-    "{% for m in messages %}{{ '<|im_start|>' + m.role + '\n' }}{% if m.content is string %}{{ m.content }}{% else %}"
-    "{% for c in m.content %}{% if c.type == 'image' %}{{ '<image>' }}{% else %}{{ c.text }}{% endif %}{% endfor %}"
-    "{% endif %}{{ '<|im_end|>\n' }}{% endfor %}"
-    "{% if add_generation_prompt %}{{ '<|im_start|>assistant\n' }}{% endif %}"
-)
+TEMPLATE = CHATML.replace("IMAGE", "{{ '<image>' }}")
 FAR_M = 100.0
 
 
