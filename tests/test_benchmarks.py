@@ -2,12 +2,10 @@
 
 import os
 import re
-import shutil
 import sys
 from pathlib import Path
 
 import pytest
-from browser import NAMES as BROWSERS
 from processes import ran
 
 FOLDER = Path(__file__).parent / "benchmarks"
@@ -35,7 +33,6 @@ bench.FITTED_ON = 200
     ("bench_flying", "--flights 2 --decisions 4 --workers 1", r"\d+ decisions in .* a second", HERE),
     ("bench_flying", "--envs", r"2 side by side: .* steps a second",
              "import cosfly.envs.episodes; cosfly.envs.episodes.NUM_DECISIONS = 4"),
-    ("bench_pages", "", r"opens in \d", SMALL_TOWN + "bench.TURNS = 1"),
     ("bench_planning", "--maps a --planners track_astar muco", r"the same loss from the same start",
              SMALL_TOWN + "scenes.NUM_WALKS, bench.WALKS = 1, bench.WALKS.model_copy(update={'num_paths': 1})"),
     ("bench_release", "8 --rounds 1", r"build: \d+ % of the speed of the copy",
@@ -54,8 +51,6 @@ bench.assemble = lambda language, out, tower: None  # needs the weights of SmolL
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case[0]} {case[1].partition(' ')[0]}")
 def test_a_benchmark_prints_its_figures(case, request, tmp_path):
     name, words, figures, before = (*case, "")[:4]
-    if name == "bench_pages" and not any(map(shutil.which, BROWSERS)):
-        pytest.skip("there is no Chromium on this machine")
     if "RUN" in words:
         words = words.replace("RUN", str(request.getfixturevalue("small_run")))
     arguments = [f"{name}.py", *words.replace("OUT", str(tmp_path / "out")).split()]

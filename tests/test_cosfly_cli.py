@@ -83,7 +83,7 @@ def test_failed_items_make_the_command_exit_1_unless_the_settings_accept_them(ca
     write_json(tmp_path / "product", {})
     stage = StageFolder(tmp_path, "plan", is_complete=False)
     stage.finish([tmp_path / "product"], Tally(input=6, kept=3, dropped={"short": 2}, failed={"no_path": 1}))
-    with pytest.raises(InputError, match=r"more items failed.*no_path 1.*at most 0"):
+    with pytest.raises(InputError, match=r"some items failed.*no_path 1.*at most 0.*max_failed=1"):
         Job(RunConfig()).finish(tmp_path / "product", tmp_path)
     Job(RunConfig(max_failed=1)).finish(tmp_path / "product", tmp_path)
     assert capfd.readouterr().out.count("product") == 2

@@ -115,7 +115,7 @@ def test_the_time_step_is_the_pedestrians(name, dt_s):
 def test_where_there_is_no_way_it_says_so(name):
     roof = kernels.obstacle_index(town_of(((0, 0, 60), (300, 300, 50))))
     scenario = make_scenario(walk_along("w", [(0, 0), (50, 0)]), roof, PlanConfig())
-    with pytest.raises(NoPathError, match=r"no (free|collision-free) ") as caught:
+    with pytest.raises(NoPathError) as caught:
         load_planner(name)(scenario, roof, PlanConfig(planner=name), np.random.default_rng(0))
     assert caught.value.where == "w"
 

@@ -46,9 +46,11 @@ class _LoggedAnswers(KeptAnswers):
     advance: Advance = lambda *_: None
 
     async def ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:
-        number, kind = len(self.exchanges[sample_id]) + 1, purpose.partition("/")[0]
+        number, (kind, ask, *correction) = len(self.exchanges[sample_id]) + 1, purpose.split("/")
         words = KINDS.get(kind, kind)
-        if "/correction" in purpose:
+        if ask != "0":
+            words += f", ask {int(ask) + 1} with another seed"
+        if correction:
             words += ", again: " + for_terminal(request.messages[-1]["content"][-1]["text"], MOST_LOGGED)
         log.info("%s: request %d, %s", sample_id, number, words)
         self.advance(0, f"waiting for answer {number}")
@@ -117,6 +119,9 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
                 yield "fix: remove caption.endpoint.json_schema=false, so that the server enforces the fields"
         else:
             yield f"no answer: {for_terminal(str(outcome))}"
+        if num_cut := sum(reply.finish_reason == "length" for _, reply in of_window):
+            limit = f"caption.endpoint.max_tokens={cfg.endpoint.max_tokens}"
+            yield f"fix: {num_cut} of {len(of_window)} answers were cut at {limit}; raise it, or use a larger model"
     num_accepted = sum(isinstance(outcome, Caption) and outcome.status == "accepted" for outcome in outcomes)
     num_answers = sum(map(len, exchanges.values()))
     yield f"=== {num_accepted} of {len(windows)} windows accepted, {num_answers} answers in {duration(seconds)} ==="

@@ -158,13 +158,15 @@ class Job:
         failed = {stage: counts.failed for stage, counts in counts_by_stage.items() if counts.failed}
         num_failed = sum(counts.total() for counts in failed.values())
         if num_failed > self.cfg.max_failed:
+            fix = "remove the causes that failures.jsonl names, and run the command again for the failed items"
+            if "caption" in failed:
+                fix += "; for refused captions see quarantine.jsonl, and run cosfly caption --retry-failed"
             raise InputError(
-                "more items failed than the setting `max_failed` allows; all other items are complete",
+                "some items failed; all others are complete",
                 where=where,
                 got="; ".join(f"{stage}: {counts_text(counts)}" for stage, counts in failed.items()),
                 expected=f"at most {self.cfg.max_failed} failed items",
-                fix="remove the causes that failures.jsonl names, and run the command again for the failed items; for "
-                "refused captions see quarantine.jsonl, and run cosfly caption --retry-failed",
+                fix=f"{fix}; to accept them, pass --set max_failed={num_failed}",
             )
 
 

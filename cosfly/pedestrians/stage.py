@@ -17,6 +17,7 @@ from pydantic import BaseModel
 
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.bystanders import BYSTANDERS_FILE, Bystanders, write_bystanders
+from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory, pace_field, paces_of, walk_id, write_paths
 from cosfly.formats.roi import read_roi
 from cosfly.geometry.trajectory_metrics import length_m
@@ -243,7 +244,7 @@ def run(
             summary["others"] = _write_bystanders(outputs[-1], [result.bystanders for result in results], header, cfg)
         write_json(out / "pedestrians_report.json", summary)
         share = summary["total"]["on_carriageway_share"]
-        if share and cfg.road_cost == 1:
+        if share and cfg.road_cost == 1 and box_map.is_any_of({KINDS["Sidewalks"]}).any():
             words = "%.1f %% of the points are on carriageways, away from crossings; "
             log.info(words + "set pedestrians.road_cost=20 to keep people on pavements", 100 * share)
         write_bytes(out / "paths.png", draw_overview(ground, paths))

@@ -21,7 +21,9 @@ OPTIONAL_PACKAGES = {  # name: the purpose, and the packages to install
     "pyrender": ("the second renderer", "-e '.[pyrender]'"),
     "ompl": ("the sampling planners of plan compare", "-e '.[ompl]'"),
     "carla": ("CARLA's maps and pictures", "-e '.[carla]'"),
-    "unrealcv": ("UnrealCV's maps and pictures", "-e '.[unrealcv]'; then --no-deps unrealcv"),
+    "unrealcv": ("UnrealCV's maps and pictures", "-e '.[unrealcv]' && pip install --no-deps unrealcv"),
+    "gymnasium": ("the environments of cosfly.envs", "-e '.[envs]'"),
+    "ray": ("workers on a Ray cluster", "-e '.[ray]'"),
 }
 FRAMES_PER_GIB = 200  # a 1280x720 frame takes about 5 MB, nearly all of it float32 depth
 LEAST_FREE_GIB = 5

@@ -37,7 +37,7 @@ class _LoggedCache(caching.FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         overload = super().load_overload(sig, target_context)
         if overload is None:
-            words = "compiling kernels of %s, once on this machine (those of planning take about 30 s), into %s"
+            words = "compiling kernels of %s, once on this machine (30 s for planning, minutes if busy), into %s"
             log.info(words, self._py_func.__module__, self.cache_path)
         return overload
 

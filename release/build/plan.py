@@ -6,6 +6,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from cosfly.formats.frames import DEPTH_PNG, FILE_NAMES, frame_name, frame_path
 from cosfly.formats.inspection import how_to_decide
@@ -15,6 +16,7 @@ from cosfly.formats.playback_file import read_track
 from cosfly.geometry.splits import Course, walks_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError, NothingKept
+from cosfly.runtime.io import CHECKSUMS, checksum_lines, read_checksums
 from cosfly.runtime.run_dir import StageFolder, Tally
 from release.build.captions import CaptionAccount, FlightKey, TrackCaptions, index_captions
 from release.build.config import ReleaseConfig
@@ -107,6 +109,7 @@ def survey_tracks(
     chosen: list[Chosen] = []
     dropped = Counter(candidate.dropped for candidate in candidates if candidate.dropped is not None)
     remaining = [candidate for candidate in candidates if candidate.dropped is None]
+    digests = set[bytes]()
 
     def courses() -> Iterator[Course]:
         """Yield the pedestrian's course of each track, and note in passing whether the track is chosen."""
@@ -118,6 +121,12 @@ def survey_tracks(
                 if kind not in tracks:
                     dropped[f"track {kind} not wanted"] += 1
                     continue
+                digest = digest_of_pictures(candidate.folder)
+                if digest in digests:  # runs of one seed have trajectories in common
+                    dropped["copy of another track"] += 1
+                    continue
+                if digest is not None:
+                    digests.add(digest)
                 captions = TrackCaptions(sources[candidate.source].captions, len(track))
                 chosen.append(Chosen(candidate, kind, (track.camera.width_px, track.camera.height_px), captions))
                 positions_m = track.targets_m - track.perturbation.target_m
@@ -125,6 +134,14 @@ def survey_tracks(
 
     walks = walks_of(courses())
     return chosen, walks, dropped
+
+
+def digest_of_pictures(folder: Path) -> bytes | None:
+    """Return a digest of the colour pictures of a track, None if the track has no checksums."""
+    if not (folder / CHECKSUMS).exists():
+        return None
+    pictures = {name: digest for name, digest in read_checksums(folder).items() if name.endswith(FILE_NAMES["rgb"])}
+    return hashlib.sha256(checksum_lines(pictures).encode()).digest() if pictures else None
 
 
 def open_track(candidate: Candidate) -> Track:
