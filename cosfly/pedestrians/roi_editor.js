@@ -9,30 +9,28 @@ const LABELS = {
   en: {
     title: "region of interest", fit: "Whole map", backdrop: "backdrop", grid: "planning grid", above: "map from above", outer: "New polygon", hole: "New hole",
     close: "Close polygon", undo: "Undo", redo: "Redo", remove: "Remove vertex", discard: "Remove polygon", vertex: "vertex", open: "Open file", save: "Save",
-    mask: "Compare mask", south: "first row is south", polygon: "polygon", holeOf: "hole", open_ring: "open", points: "points",
+    polygon: "polygon", holeOf: "hole", open_ring: "open", points: "points",
     keys: "Click: vertex. Drag: move. Double click on an edge: new vertex. Wheel: zoom; right drag: pan. Keys: arrows move the vertex by a cell (Shift: ten) or pan; N, B next and previous vertex; " +
       "Space: vertex at the cross; + - zoom; Esc: clear the selection.",
     occupied: "occupied", margin: "safety margin", unused: "free, other ground or too small", free: "free", in_region: "in the region", walkable: "walkable", outside: "outside the map", cell: "cell",
     region: "cells in the region", walkable_cells: "walkable cells", components: "components", large: "large enough", largest: "largest", used: "cells used",
     saved: "saved to", unsaved: "not saved", whole: "the whole map: no polygon is closed", few: "a polygon needs three vertices", nowhere: "a hole must begin inside a closed polygon",
-    size: "the mask has a different size", expected: "expected", masked: "mask", same_region: "equal to the region", same_walkable: "equal to walkable cells", here: "only here", there: "only in the mask",
-    not_saved: "close the open polygon first", drawing: "click to add vertices, then close the polygon", lost: "the server of the editor does not answer; start the editor again", no_picture: "cannot be read as a picture", large_file: "the file is too large",
+    not_saved: "close the open polygon first", drawing: "click to add vertices, then close the polygon", lost: "the server of the editor does not answer; start the editor again", large_file: "the file is too large",
   },
   zh: {
     title: "感兴趣区域", fit: "全图", backdrop: "底图", grid: "规划栅格", above: "俯视图", outer: "新多边形", hole: "新孔洞",
     close: "闭合多边形", undo: "撤销", redo: "重做", remove: "删除顶点", discard: "删除多边形", vertex: "顶点", open: "打开文件", save: "保存",
-    mask: "对比掩膜", south: "首行为南", polygon: "多边形", holeOf: "孔洞", open_ring: "未闭合", points: "个点",
+    polygon: "多边形", holeOf: "孔洞", open_ring: "未闭合", points: "个点",
     keys: "单击：加顶点；拖动：移动；双击边：插入顶点；滚轮：缩放；右键拖动：平移。按键：方向键移动顶点一格（Shift：十格）或平移；N、B 下一个/上一个顶点；空格：在十字处加顶点；+ - 缩放；Esc：取消选择。",
     occupied: "占用", margin: "安全边距", unused: "空闲但不用", free: "空闲", in_region: "区域内", walkable: "可行走", outside: "地图之外", cell: "栅格",
     region: "区域内栅格", walkable_cells: "可行走栅格", components: "连通块", large: "足够大", largest: "最大", used: "使用的栅格",
     saved: "已保存到", unsaved: "未保存", whole: "整张地图：没有闭合的多边形", few: "多边形至少需要三个顶点", nowhere: "孔洞须从已闭合的多边形内开始",
-    size: "掩膜尺寸不同", expected: "应为", masked: "掩膜", same_region: "与区域相同", same_walkable: "与可行走栅格相同", here: "仅此处", there: "仅掩膜",
-    not_saved: "请先闭合多边形", drawing: "单击添加顶点，然后闭合多边形", lost: "编辑器服务没有应答：它还在运行吗？", no_picture: "无法作为图片读取", large_file: "文件太大",
+    not_saved: "请先闭合多边形", drawing: "单击添加顶点，然后闭合多边形", lost: "编辑器服务没有应答：它还在运行吗？", large_file: "文件太大",
   },
 };
-const state = { rings: [], ring: -1, vertex: -1, kind: "outer", cross: null, answer: data, mask: null, language: navigator.language.startsWith("zh") ? "zh" : "en", said: ["drawing", ""] };
+const state = { rings: [], ring: -1, vertex: -1, kind: "outer", cross: null, answer: data, language: navigator.language.startsWith("zh") ? "zh" : "en", said: ["drawing", ""] };
 const steps = { list: [[]], at: 0 };
-const layers = { grid: null, cells: null, above: null, mask: null };
+const layers = { grid: null, cells: null, above: null };
 let values = null, marks = null;  // of each cell, north up: grey level of the grid; 0, in the region, walkable
 const say = (word) => LABELS[state.language][word] ?? word;
 
@@ -107,7 +105,7 @@ function toRoi() {  // closed rings in the file's form: each hole goes with the 
   }
   const [{ points_world, holes }, ...others] = polygons;
   const more = { ...(holes.length ? { holes } : {}), ...(others.length ? { polygons: others } : {}) };
-  return { description: "edited ROI polygon from mask editor", map: data.map, axes: data.axes, closed: true, points_world, ...more };
+  return { description: "edited ROI polygon", map: data.map, axes: data.axes, closed: true, points_world, ...more };
 }
 function ofRoi(roi) {
   const polygons = roi.points_world.length ? [roi, ...roi.polygons] : roi.polygons;
@@ -146,7 +144,6 @@ async function take(answer) {
   layers.cells = bitmap;
   marks = pixelsOf(bitmap, 3);
   state.answer = answer;
-  compare();
   update();
 }
 function pixelsOf(bitmap, channel) {
@@ -173,36 +170,6 @@ const save = () => attempt(async () => {
   tell("saved", answer.saved);
 });
 
-// --- a mask to compare ------------------------------------------------------------------------------------------------
-
-const openMask = (file) => attempt(async () => {
-  const bitmap = await createImageBitmap(file).catch(() => { throw new Error(`${file.name}: ${say("no_picture")}`); });
-  if (bitmap.width !== NUM_X || bitmap.height !== NUM_Y) throw new Error(`${say("size")}: ${bitmap.width} x ${bitmap.height}; ${say("expected")} ${NUM_X} x ${NUM_Y}`);
-  state.mask = pixelsOf(bitmap, 0);
-  compare();
-  map.redraw();
-});
-function compare() {
-  layers.mask = null;
-  byId("compared").hidden = !state.mask || !marks;
-  if (byId("compared").hidden) return;
-  const size = NUM_X * NUM_Y, image = new ImageData(NUM_X, NUM_Y), fromSouth = byId("south").checked;
-  let cells = 0, region = 0, walkable = 0, here = 0, there = 0;
-  for (let i = 0; i < size; i += 1) {
-    const row = Math.floor(i / NUM_X), masked = state.mask[fromSouth ? (NUM_Y - 1 - row) * NUM_X + (i % NUM_X) : i] > 127, walks = marks[i] === data.alphas[1];
-    cells += masked;
-    region += masked === marks[i] > 0;
-    walkable += masked === walks;
-    here += walks && !masked;
-    there += masked && !walks;
-    if (masked !== walks) image.data.set(masked ? [214, 40, 180, 200] : [240, 150, 0, 200], 4 * i);
-  }
-  layers.mask = new OffscreenCanvas(NUM_X, NUM_Y);
-  layers.mask.getContext("2d").putImageData(image, 0, 0);
-  const share = (count) => `${((100 * count) / size).toFixed(2)} %`, number = (count) => count.toLocaleString("en");
-  byId("compared").textContent = `${say("masked")}: ${number(cells)}; ${say("same_region")} ${share(region)}; ${say("same_walkable")} ${share(walkable)}; ${say("here")} ${number(here)}; ${say("there")} ${number(there)}`;
-}
-
 // --- what is shown ---------------------------------------------------------------------------------------------------
 
 function paint() {
@@ -210,7 +177,6 @@ function paint() {
   if (layers.grid) map.picture(layers.grid, BOUNDS);
   if (backdrop === "above" && layers.above) map.picture(layers.above, BOUNDS, true);
   if (layers.cells && state.rings.some((ring) => ring.closed)) map.picture(layers.cells, BOUNDS);
-  if (layers.mask) map.picture(layers.mask, BOUNDS);
   const first = state.rings.findIndex((ring) => !ring.hole);
   state.rings.forEach((ring, number) => {
     const color = ring.hole ? COLORS.hole : number === first ? COLORS.outer : COLORS.other;
@@ -354,13 +320,10 @@ document.addEventListener("keydown", (event) => {
 });
 const BUTTONS = {
   fit: () => map.fit(), outer: () => begin("outer"), hole: () => begin("hole"), close, undo: () => stepTo(steps.at - 1), redo: () => stepTo(steps.at + 1), remove: removeVertex, discard, save,
-  language: () => { state.language = state.language === "en" ? "zh" : "en"; tell(...state.said); compare(); update(); },
+  language: () => { state.language = state.language === "en" ? "zh" : "en"; tell(...state.said); update(); },
 };
 for (const [id, work] of Object.entries(BUTTONS)) byId(id).addEventListener("click", () => { work(); board.focus(); });
-for (const [id, work] of [["open", openFile], ["mask", openMask]]) {
-  byId(id).addEventListener("change", () => { if (byId(id).files.length) work(byId(id).files[0]); byId(id).value = ""; });
-}
-byId("south").addEventListener("change", () => { compare(); map.redraw(); });
+byId("open").addEventListener("change", () => { if (byId("open").files.length) openFile(byId("open").files[0]); byId("open").value = ""; });
 byId("backdrop").addEventListener("change", () => attempt(async () => {
   const name = byId("backdrop").value;
   if (name !== "grid" && !layers[name]) layers[name] = await createImageBitmap(await (await request(name)).blob());
