@@ -40,6 +40,7 @@ from cosfly.formats.town import write_town_map
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.trajectory_metrics import derivative_rms, length_m
 from cosfly.runtime.errors import ConfigError, InputError, NothingKept, VerifyError
+from cosfly.runtime.io import sha256_file, write_checksums
 from cosfly.runtime.json_io import read_json
 from cosfly.runtime.png import colours_of
 from release.build.config import ReleaseConfig
@@ -115,6 +116,17 @@ def test_splits_share_no_walk_and_no_twins(material, tmp_path):
         assert (row["split"], row["walk"], row["pair"]) == (entry.split, entry.walk, entry.pair)
     for shard in record.shards:
         assert f"data/{shard.split}-{record.content_digest[:12]}-" in shard.path
+
+
+def test_a_track_that_two_runs_have_is_released_once(copy, tmp_path):
+    for folder in find_tracks(copy / "tree"):
+        files = [path for path in folder.rglob("*") if path.is_file()]
+        write_checksums(folder, {path.relative_to(folder).as_posix(): sha256_file(path) for path in files})
+    other = shutil.copytree(copy, tmp_path / "other")
+    product = run(split_cfg(), [source_of(copy), source_of(other, "two")], tmp_path / "r")
+    counts = json.loads((tmp_path / "r/manifest.json").read_text())["counts"]
+    assert len(read_record(product / "release.json").flights) == counts["kept"] == counts["input"] / 2
+    assert counts["dropped"] == {"copy of another track": counts["kept"]}
 
 
 def test_neither_twin_goes_without_the_other_unless_asked(copy, tmp_path):
