@@ -6,7 +6,6 @@ again.
 
 import asyncio
 import logging
-import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -25,15 +24,13 @@ from caption.teachers.teacher import EMBEDDED, AskingTeacher, open_teacher
 from cosfly.formats.captions import FIELDS, Caption
 from cosfly.llm.answers import AnswerBook, Budget, KeptAnswers
 from cosfly.llm.contract import NoAnswer, Reply, Request, run_until_interrupted
-from cosfly.runtime.console import Advance, duration, progress_bar
+from cosfly.runtime.console import Advance, progress_bar
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError, TeacherError
 from cosfly.runtime.escaping import LONGEST_LOG, for_terminal
 from cosfly.runtime.model_json import find_object
 
 log = logging.getLogger(__name__)
 
-# Reasons why an answer has no JSON object, in words.
-STRUCTURES = {"no_json_object": "no JSON object", "cut_short": "cut at caption.endpoint.max_tokens"}
 KINDS = {"free": "English", "mirror": "Chinese"}  # of requests, by the first word of their purpose
 MOST_LOGGED = 200  # characters of a request or an answer
 
@@ -47,9 +44,7 @@ class _LoggedAnswers(KeptAnswers):
 
     async def ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:
         number, (kind, ask, *correction) = len(self.exchanges[sample_id]) + 1, purpose.split("/")
-        words = KINDS.get(kind, kind)
-        if ask != "0":
-            words += f", ask {int(ask) + 1} with another seed"
+        words = KINDS.get(kind, kind) + ("" if ask == "0" else f", ask {int(ask) + 1} with another seed")
         if correction:
             words += ", again: " + for_terminal(request.messages[-1]["content"][-1]["text"], MOST_LOGGED)
         log.info("%s: request %d, %s", sample_id, number, words)
@@ -81,7 +76,6 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
     num_of_track = Counter(unfinished[number * len(unfinished) // num_windows] for number in range(num_windows))
     windows = [window for track, count in num_of_track.items() for window in islice(track.windows(cfg), count)]
     exchanges: dict[str, list[tuple[Request, Reply]]] = {window.observed.sample_id: [] for window in windows}
-    start_s = time.monotonic()
 
     async def ask(advance: Advance) -> list[Caption | BaseException]:
         with AnswerBook(out / ANSWERS) as book:
@@ -95,7 +89,6 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
     log.info("a window takes 2 answers, up to %d if some are refused, and more if a decision is in conflict", MOST_ASKS)
     with progress_bar("answers", None) as advance:
         outcomes = run_until_interrupted(ask(advance))
-    seconds = time.monotonic() - start_s
     for outcome in outcomes:
         if not isinstance(outcome, Caption | NoAnswer | CosflyError):
             raise outcome
@@ -123,8 +116,7 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
             limit = f"caption.endpoint.max_tokens={cfg.endpoint.max_tokens}"
             yield f"fix: {num_cut} of {len(of_window)} answers were cut at {limit}; raise it, or use a larger model"
     num_accepted = sum(isinstance(outcome, Caption) and outcome.status == "accepted" for outcome in outcomes)
-    num_answers = sum(map(len, exchanges.values()))
-    yield f"=== {num_accepted} of {len(windows)} windows accepted, {num_answers} answers in {duration(seconds)} ==="
+    yield f"=== {num_accepted} of {len(windows)} windows accepted, {sum(map(len, exchanges.values()))} answers ==="
 
 
 def _outcome_lines(caption: Caption) -> Iterator[str]:
@@ -165,4 +157,4 @@ def _answer_lines(number: int, reply: Reply) -> Iterator[str]:
 def _problem_of(reply: Reply) -> str:
     """Return why an answer has no JSON object, after a comma; "" if it has one."""
     reason = find_object(reply.text, FIELDS, reply.finish_reason).reason
-    return f", {STRUCTURES.get(reason, reason.replace('_', ' '))}" if reason else ""
+    return f", {reason.replace('_', ' ')}" if reason else ""
