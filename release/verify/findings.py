@@ -23,9 +23,9 @@ class Kind(Issue):
     examples: list[str]  # the first places
 
     def __str__(self) -> str:
-        times = "once" if self.count == 1 else f"{self.count:,} times"
+        times = f" ({self.count:,} times)" if self.count > 1 else ""
         more = f"; also {', '.join(self.examples[1:])}" if len(self.examples) > 1 else ""
-        text = f"{self.severity}: {self.code}: {times}: {self.where}: got {self.got}; expected {self.expected}{more}"
+        text = f"{self.severity}: {self.code}{times}: {self.where}: got {self.got}; expected {self.expected}{more}"
         return " ".join(for_terminal(text).split())
 
 
