@@ -226,7 +226,7 @@ def test_a_trial_shows_questions_answers_and_outcomes_and_keeps_the_answers(tree
         text = "\n".join(
             show_windows(settings(server.url, endpoint={"json_schema": False}), tree, tmp_path / "prose", 1)
         )
-    assert text.count(", no JSON object) ---") == 3
+    assert text.count(", no json object) ---") == 3
     assert "fix: remove caption.endpoint.json_schema=false" in text
     with pytest.raises(ConfigError, match="asks no model"):
         list(show_windows(CaptionConfig(), tree, tmp_path / "out", 1))

@@ -108,7 +108,7 @@ def progress_bar(label: str, total: int | None, done: int = 0) -> Iterator[Advan
 
 def duration(seconds: float) -> str:
     """Return a time in its usual unit: 42 s, 7 min, 3.4 h, 2.1 days."""
-    if seconds < 90:
+    if seconds < 120:
         return f"{max(seconds, 0):.0f} s"
     if seconds < 5400:
         return f"{seconds / 60:.0f} min"
