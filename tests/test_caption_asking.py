@@ -196,11 +196,11 @@ def test_windows_with_recorded_answers_say_nothing_about_the_time_that_is_left()
     totals, shown = Counter[str](), list[str]()
     progress = asking.RunProgress(lambda count, words: shown.append(words), 3, Budget(BudgetConfig(), 1, totals))
     progress.add(None)
-    assert "0 answers in " in shown[-1]
+    assert "answers 0 in " in shown[-1]
     assert " left" not in shown[-1]
     totals["answers"] += 1
     progress.add(None)
-    assert re.search(r"1 answers in .* windows/s, .* left", shown[-1])
+    assert re.search(r"answers 1 in .* windows/s, .* left", shown[-1])
 
 
 def test_a_trial_shows_questions_answers_and_outcomes_and_keeps_the_answers(tree, tmp_path):

@@ -166,7 +166,7 @@ def test_work_without_progress_logs_a_heartbeat(monkeypatch, caplog):
     monkeypatch.setattr(console, "SECONDS_OF_SILENCE", 0.001)
     with caplog.at_level("INFO"), console.progress_bar("demo", 2) as advance:
         advance(1, "the second item")
-        wait_until(lambda: caplog.text.count("demo: 1 of 2, the second item, for ") >= 2)
+        wait_until(lambda: caplog.text.count("demo: 1 of 2, the second item, no change for ") >= 2)
 
 
 def test_workers_that_die_all_the_time_end_the_stage(tmp_path):

@@ -321,7 +321,7 @@ class RunProgress:
             f"accepted {windows.kept:,} (repaired {self.num_repaired:,})",
             f"dropped {windows.dropped.total():,}" + (f" ({reasons})" if reasons else ""),
             f"no answer {windows.failed.total():,}",
-            f"{answers['answers']:,} answers in {duration(elapsed_s)}",
+            f"answers {answers['answers']:,} in {duration(elapsed_s)}",
             f"tokens {answers['prompt_tokens']:,} in {answers['completion_tokens']:,} out",
         ]
         if prices.price_prompt or prices.price_completion:

@@ -247,11 +247,8 @@ class _Examination:
         answer_s = endpoint.max_tokens / self.tokens_per_s if self.tokens_per_s else 0.0
         if endpoint.json_schema and answer_s <= endpoint.timeout_s:  # else it is too slow without a schema, too
             system, *others = self.largest
-            prompt = [
-                system | {"content": f"Again.\n{system['content']}"},
-                *others,
-            ]  # not the one in the server's cache
-            plain = await self._ask("the largest prompt without a JSON schema", prompt, endpoint.max_tokens)
+            other = [system | {"content": f"Again.\n{system['content']}"}, *others]  # which no cache holds
+            plain = await self._ask("the largest prompt without a JSON schema", other, endpoint.max_tokens)
             if plain.reply is not None:
                 contrast = f"but one within {plain.seconds:.0f} s without a JSON schema"
                 self._add("speed", "unusable", f"{detail}, {contrast}: set caption.endpoint.json_schema=false")

@@ -91,7 +91,7 @@ def progress_bar(label: str, total: int | None, done: int = 0) -> Iterator[Advan
                 since = ""
             elif unchanged_s >= next_line_s:
                 next_line_s *= 2
-                since = f", for {duration(unchanged_s)} so far"
+                since = f", no change for {duration(unchanged_s)}"
             else:
                 continue
             position, words = shown

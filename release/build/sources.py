@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
@@ -10,12 +11,14 @@ from pathlib import Path
 from cosfly.formats.boxes import UNKNOWN_LICENCE
 from cosfly.formats.inspection import REVIEW, Inspection, TrajectoryFunnel, read_settled
 from cosfly.formats.places import ALL_TRACKS, Place, TrackChoice, flight_ids, folder_name
-from cosfly.formats.town import read_town_map
+from cosfly.formats.town import IDS_FILE, read_town_map
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import ConfigError, InputError
-from cosfly.runtime.io import check_stays_below, inside
+from cosfly.runtime.io import check_stays_below, inside, sha256_file
 from release.build.captions import FlightKey
 from release.record import ReleasedMap
+
+log = logging.getLogger(__name__)
 
 IN_REVIEW = "review: "  # begin of the reason to drop a track that waits for a person's decision
 NOT_CHOSEN = "not chosen"  # the reason to drop a track that `release.flights` does not name
@@ -186,10 +189,19 @@ def _funnel_of(inspections: list[Inspection]) -> TrajectoryFunnel | None:
 
 
 def maps_of(candidates: list[Candidate]) -> list[ReleasedMap]:
-    """Return the maps of the towns of tracks, each once."""
+    """Return the maps of the towns of tracks, each once; warn of different maps of one name."""
     towns = {(track.place.town, track.folder.parent.parent) for track in candidates}
+    maps_of_town = Counter(town for town, _ in {(town, _digest_of_map(folder)) for town, folder in towns})
+    for town in sorted(town for town, count in maps_of_town.items() if count > 1):
+        words = "release: %d different maps are named %s and count as one town; give each a name (maps.synthetic.name)"
+        log.warning(words, maps_of_town[town], town)
     maps = {ReleasedMap(town=town, **dict(read_town_map(folder))) for town, folder in towns}
     return sorted(maps, key=lambda town_map: (town_map.town, town_map.name, town_map.licence, town_map.credits))
+
+
+def _digest_of_map(town: Path) -> str:
+    """Return a digest of the boxes of a town's map; "" for a foreign tree."""
+    return sha256_file(town / IDS_FILE) if (town / IDS_FILE).exists() else ""
 
 
 def _place(source: Source, folder: Path) -> Place:
