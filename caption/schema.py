@@ -214,7 +214,7 @@ class CaptionConfig(Config):
     repair: RepairConfig = Field(RepairConfig(), description="regeneration of rejected samples")
     judge: JudgeConfig = Field(JudgeConfig(), description="an optional judge of conflicts")
     stop_after_dropped: MayDiffer[int] = Field(
-        50, ge=0, description="end the run if none of this number of first answers is accepted; 0: never"
+        50, ge=0, description="end the run if none of this number of first windows is accepted; 0: never"
     )
     limit: MayDiffer[int | None] = Field(None, ge=1, description="caption at most this many windows; empty: all")
 

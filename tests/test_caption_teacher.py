@@ -204,7 +204,7 @@ def test_a_retry_after_holds_every_request():
 
 def test_a_hopeless_teacher_is_stopped_and_its_commonest_reasons_are_explained(tree, tmp_path):
     cfg = {"stop_after_dropped": 3, "endpoint": {"concurrency": 1}, "repair": KEEP}
-    told = r"none of the first 3 windows.*3 dropped because of structure: the last answer did not have the requested"
+    told = r"none of the first 3 windows.*3 structure: the last answer did not have the requested"
     with deciding("ascend", lambda number, body: "short") as server:
         with pytest.raises(TeacherError, match=told):
             run(settings(server.url, **cfg), tree, tmp_path / "out")
@@ -351,7 +351,7 @@ def test_what_a_model_declined_is_asked_again(small_tree, tmp_path, whole):
     out, answer = tmp_path / "out", (200, completion)
     with deciding(respond=lambda body: answer) as server:
         for retry_failed in (False, True):
-            with pytest.raises(NothingKept, match=r"10 dropped because of declined: the model declined to answer"):
+            with pytest.raises(NothingKept, match=r"10 declined: the model declined to answer"):
                 run(quick(server.url), small_tree, out, retry_failed=retry_failed)
         answer = None
         assert run(quick(server.url), small_tree, out, retry_failed=True).read_bytes() == whole[0]

@@ -106,7 +106,7 @@ def test_what_a_prompt_says_there_is_none_of_is_not_there():
     for prompt in ("a village with a well and no fountain or church", "a village without any fountain, with a well"):
         assert [one.name for one in by_rules(prompt).objects] == ["well"]
     plan, trace = plan_by_rules("a tiny ski resort, no high-rise towers, no cars and without trees", 0)
-    assert (trace["settlement"], trace["cars"], trace["without"]) == ("resort", "none", "high-rise towers ")
+    assert (trace["settlement"], trace["cars"], trace["without"]) == ("resort", "none", "high-rise towers, ")
     assert plan.parked_share == 0.0 < by_rules("a tiny ski resort").parked_share
     assert plan.trees_per_ha == (0.0, 0.0)
     assert [one.name for one in by_rules("a village, no fountain but a well").objects] == ["well"]

@@ -48,7 +48,7 @@ def most_common(counts: Mapping[str, int]) -> dict[str, int]:
 def explain_drops(dropped: Mapping[str, int]) -> str:
     """Return the three most common reasons with their counts and meanings."""
     reasons = list(most_common(dropped).items())[:3]
-    return "; ".join(f"{count} dropped because of {reason}: {REASONS[reason]}" for reason, count in reasons)
+    return "; ".join(f"{count} {reason}: {REASONS[reason]}" for reason, count in reasons)
 
 
 # --- the report -------------------------------------------------------------------------------------------------------

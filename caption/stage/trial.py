@@ -37,7 +37,7 @@ MOST_LOGGED = 200  # characters of a request or an answer
 
 @dataclass
 class _LoggedAnswers(KeptAnswers):
-    """Answers of which each request and answer is logged and kept by window."""
+    """Logs each request and answer, and keeps them by window."""
 
     exchanges: dict[str, list[tuple[Request, Reply]]] = field(default_factory=dict)
     advance: Advance = lambda *_: None
@@ -86,7 +86,7 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
                 asked = [caption_window(window, teacher, cfg, vocabulary) for window in windows]
                 return await asyncio.gather(*asked, return_exceptions=True)
 
-    log.info("a window takes 2 answers, up to %d if some are refused, and more if a decision is in conflict", MOST_ASKS)
+    log.info("a window takes 2 answers, up to %d if some are rejected, more after a wrong decision or value", MOST_ASKS)
     with progress_bar("answers", None) as advance:
         outcomes = run_until_interrupted(ask(advance))
     for outcome in outcomes:
@@ -125,7 +125,7 @@ def _outcome_lines(caption: Caption) -> Iterator[str]:
     yield caption.status if reason is None else f"dropped because of {reason}: {REASONS[reason]}"
     facts = [("label", caption.label), ("verdict", caption.verdict)]
     facts += [("structure", checks.structure), ("refusal", checks.refusal)]
-    facts += [("answer refused", reason) for reason in checks.refused or ()]
+    facts += [("answer rejected", reason) for reason in checks.refused or ()]
     facts += [("contradicted", text) for text in checks.contradictions or ()]
     for language, answer in (("en", caption.en), ("zh", caption.zh)):
         if answer is not None:

@@ -151,7 +151,8 @@ class Job:
         from cosfly.runtime.run_dir import read_manifest
 
         typer.echo(product)
-        self.check_failures({out.name: read_manifest(out).counts}, out / "failures.jsonl")
+        manifest = read_manifest(out)
+        self.check_failures({manifest.stage: manifest.counts}, out / "failures.jsonl")
 
     def check_failures(self, counts_by_stage: Mapping[str, Tally], where: Path) -> None:
         """Raise InputError if more items failed than the settings accept; all work is done before."""
@@ -159,7 +160,7 @@ class Job:
         num_failed = sum(counts.total() for counts in failed.values())
         if num_failed > self.cfg.max_failed:
             fix = "remove the causes that failures.jsonl names, and run the command again for the failed items"
-            if "caption" in failed:
+            if any(stage.endswith("caption") for stage in failed):
                 fix += "; for refused captions see quarantine.jsonl, and run cosfly caption --retry-failed"
             raise InputError(
                 "some items failed; all others are complete",

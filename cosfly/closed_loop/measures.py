@@ -97,13 +97,16 @@ def episode_digest(episode: Episode) -> str:
 
 
 def score_episodes(records: Iterable[Episode], *, seed: int = 0, most_decisions: int = 0) -> Score:
-    """Score the episodes of one student, at least one, in any order."""
+    """Score the episodes of one student, at least one, in any order. most_decisions: The limit that may have shortened
+    them."""
     measured = []
     digests = []
     for episode in records:
         measured.append(measure(episode))
         digests.append(episode_digest(episode))
     measured.sort(key=lambda score: (score.town, score.episode))
+    if not any(sum(score.answers.values()) == most_decisions for score in measured):
+        most_decisions = 0
     figures = figures_of(measured, rng_for(seed, "score", "draws"))
     return Score(
         episodes_sha256=sha256_bytes(dump_json(sorted(digests)).encode()),

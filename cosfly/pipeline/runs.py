@@ -245,14 +245,14 @@ def caveats(cfg: RunConfig) -> list[str]:
         height_px = focal_px * (PERSON_M * apart_m + PERSON_DEPTH_M * up_m) / math.hypot(apart_m, up_m) ** 2
         if share > 0 and height_px < LEGIBLE_HEIGHT_PX:
             small[f"{name} {height_px:.0f} px"] = share
-    if sum(small.values()) < SMALL_SHARE * sum(plan.styles.values()):
-        return cfg.plan.remarks()
-    return [
-        *cfg.plan.remarks(),
-        f"the target is lower than {LEGIBLE_HEIGHT_PX:g} px in pictures ({', '.join(small)}), so it can hardly be "
-        "recognized. Choose larger pictures (render.width_px), a narrower field of view (render.fovs_deg), or smaller "
-        "distances (plan.behind_distance_m, plan.altitude_preferred_m, plan.style_ranges)",
-    ]
+    remarks = plan.remarks()
+    if sum(small.values()) >= SMALL_SHARE * sum(plan.styles.values()):
+        remarks.append(
+            f"the target is lower than {LEGIBLE_HEIGHT_PX:g} px in pictures ({', '.join(small)}), so it can hardly be "
+            "recognized. Choose larger pictures (render.width_px), a narrower field of view (render.fovs_deg), or "
+            "smaller distances (plan.behind_distance_m, plan.altitude_preferred_m, plan.style_ranges)"
+        )
+    return remarks
 
 
 def in_words(num_bytes: float) -> str:

@@ -112,7 +112,7 @@ class _Reader:
         # What is read by `_take_phrases`.
         self.sizes: dict[str, re.Match[str]] = {}  # of the town, by name in _SIZES
         self.heights: dict[str, re.Match[str]] = {}  # of buildings, by name in _HEIGHTS
-        self.absent = ""  # what there is not, such as "towers "
+        self.absent = ""  # what there is not, such as "towers, "
         self.objects: dict[str, int] = {}  # counts
         self.buildings: dict[str, int | None] = {}  # counts by kind; None for a plural without a number
         self.pattern: str | None = None  # of streets, if it is named
@@ -209,7 +209,7 @@ class _Reader:
         for name in limits[1:]:  # only the first limits the highest building
             self.not_used.append(self.heights.pop(name)[0].strip())
         while match := self._take(_ABSENT):  # before the nouns: "without towers" names no tower
-            self.absent += f"{match[1]} "
+            self.absent += f"{match[1]}, "
         self.objects = self._take_objects()  # before buildings: a clock tower is no tower
         for word in _words(WORDS["lacking"]):  # before buildings: a control tower is none either
             if match := self._take(rf"(?:\b\d+ )?\b{word}s?\b"):
@@ -275,8 +275,9 @@ class _Reader:
             if self._has(word):
                 self.plan[field] = width_m
         for word, field in WORDS["open"].items():
-            if re.search(rf"\b{word}s?\b", self.absent):
+            if re.search(rf"(?:^|, ){word}s?, ", self.absent):
                 self.plan[field] = 0
+        for word, field in WORDS["open"].items():
             # "Houses with gardens" means no several blocks.
             count = self._take_counted(word, plural_count=1 if word in ("garden", "lawn") else SEVERAL_OPEN)
             if count is not None:

@@ -196,7 +196,7 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
         log.warning("%s", problems)
     by_seed = "" if trace.get("pattern_is_named", True) else " (chosen by the seed)"
     water = f" and water {plan.river_m:g} m wide" if plan.river_m else ""
-    counts = Counter({"plaza": plan.plazas, "green": plan.greens}) + Counter(obj.name for obj in town.placed)
+    counts = Counter([name for name, _ in _open_blocks(town, plan)] + [obj.name for obj in town.placed])
     place = trace.get("settlement", "town")
     log.info("the %s has %s streets%s%s; placed: %s", place, plan.pattern, by_seed, water, counts_text(counts))
     num_kept = 1 + len(town.placed)
@@ -209,13 +209,17 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     return product
 
 
+def _open_blocks(town: Town, plan: WorldPlan) -> list[tuple[str, shapely.Polygon]]:
+    """Return the open blocks that were asked for, with their names; others are for objects."""
+    return list(zip(["plaza"] * plan.plazas + ["green"] * plan.greens, town.open_blocks, strict=False))
+
+
 def _picture(town: Town, plan: WorldPlan) -> bytes:
     """Draw a town from above, with the names of its open blocks and objects, as PNG bytes."""
     view = TopView.around(np.stack(town.boxes.bounds()), PICTURE_PX)
     picture = draw_map(town.boxes, view)
-    block_names = ["plaza"] * plan.plazas + ["green"] * plan.greens  # in the order of the open blocks
     labels = [(obj.name, obj.xy) for obj in town.placed if obj.number == 0 and OBJECTS[obj.name].where != "layout"]
-    for name, block in zip(block_names, town.open_blocks, strict=False):
+    for name, block in _open_blocks(town, plan):
         if not any(block.covers(shapely.Point(xy)) for _, xy in labels):
             labels.append((name, block.centroid.coords[0]))
     draw_labels(picture, [(name, view.pixels(np.array([xy]))[0]) for name, xy in labels])

@@ -47,7 +47,7 @@ NOTES = [
     "The majority gives one answer of the training split to every sample. The rule is a decision tree of depth two, "
     "and blind a small network, on the poses and positions of the last frames as they were drawn, which the prompt "
     "describes; both are fitted on the decisions of the training split and see no picture. "
-    f"The network needs {LEAST_WINDOWS} training samples.",
+    f"The network needs {LEAST_WINDOWS} training samples in a language.",
     "The paper's columns were measured on 10,000 samples of its own data, with layer 17 of roberta-large and another "
     "teacher, so only the distance to the baselines can be compared.",
 ]
@@ -158,7 +158,7 @@ def summary_tables(product: Path) -> Iterator[TextTable]:
         counts = f"samples: {part.samples}, pedestrian trajectories: {part.walks}"
         counts += f", decisions of the teacher: {len(part.who[TEACHER].by_decision)}"
         if "blind" not in part.who:
-            counts += f", no blind network: it needs {LEAST_WINDOWS} training samples"
+            counts += f", no blind network: it needs {LEAST_WINDOWS} training samples in this language"
         title = f"{LANGUAGES[language]} ({counts}); all figures are in evaluation.html"
         yield TextTable(title, ["", *(FIGURES[key] for key in SUMMARY)], rows)
 

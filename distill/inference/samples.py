@@ -25,7 +25,7 @@ class InferConfig(Config):
     """Settings of `distill infer`."""
 
     split: Split = Field("test", description="split whose samples are answered")
-    max_samples: int = Field(0, ge=0, description="samples to answer, drawn at random, the same in every run; 0: all")
+    max_samples: int = Field(0, ge=0, description="samples to answer, chosen at random, the same in every run; 0: all")
     max_new_tokens: int = Field(
         512, ge=1, description="longest answer, tokens; a longer answer is cut and does not parse"
     )

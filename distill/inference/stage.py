@@ -133,7 +133,8 @@ async def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path) -> tuple[list
         answering: LocalAnswers | EngineAnswers
         if cfg.engine == "transformers":
             with contextlib.suppress(ValueError):  # not in the main thread, which gets no Ctrl-C
-                signal.signal(signal.SIGINT, signal.default_int_handler)  # asyncio's waits for the end of a batch
+                if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as of a command in the background
+                    signal.signal(signal.SIGINT, signal.default_int_handler)  # asyncio's waits for the end of a batch
             answering = LocalAnswers(cfg, inputs, book)
         else:
             engine: Engine

@@ -210,7 +210,7 @@ def _take_steps(context: TrainingContext, optimizer: Any, progress: Progress, fo
     rank, num_ranks = accelerator.process_index, accelerator.num_processes
     num_steps, per_epoch = count_steps(cfg, len(lengths))
     first = progress.step
-    words = f"{'resumes' if first else 'begins'} with step %d of %d, each of %d samples; %d steps are one pass"
+    words = f"{'resumes' if first else 'begins'} with step %d of %d, %d samples each; %d steps are one pass over them"
     log.info(f"%s: {words}", STAGE, first + 1, num_steps, cfg.samples_per_step, per_epoch)
     start_s = time.monotonic()
     step_start_s = saved_s = start_s

@@ -106,6 +106,8 @@ class TrainingSplit:
         """Encode at most so many samples, chosen at random, and skip those that cannot be used."""
         known: dict[FramePicture, FramePicture] = {}  # equal pictures become one object
         indices = generator.permutation(len(self.samples)).tolist()
+        if workers < 0:  # no more than the samples that are needed keep busy
+            workers = min(MOST_WORKERS, num_cpus(), most // SAMPLES_PER_WORKER)
         encoded = in_order(partial(self._encode, max_tokens=max_tokens), indices, workers)
         with progress_bar(f"{STAGE}: encoding texts", total=min(most, len(indices))) as advance:
             while len(self.used) < most and (sample := next(encoded, None)):
@@ -114,7 +116,7 @@ class TrainingSplit:
                 else:
                     pictures = tuple(known.setdefault(picture, picture) for picture in sample.pictures)
                     self.used.append(sample._replace(pictures=pictures))
-                advance(1)
+                    advance(1)
         self.used.sort(key=lambda sample: sample.sample_index)
 
     def _encode(self, index: int, max_tokens: int) -> TrainingSample | SkippedSample:

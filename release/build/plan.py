@@ -86,8 +86,8 @@ def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> 
     cannot be released."""
     material = gather(sources, include_review=cfg.include_review, choice=TrackChoice(match=cfg.flights))
     tracks, walks, dropped = survey_tracks(material.candidates, sources, cfg.tracks)
-    tracks, without_twin = keep_pairs(tracks, cfg)
-    dropped = dropped + without_twin
+    tracks, left_out = keep_pairs(tracks, cfg)
+    dropped = dropped + left_out
     _check_sizes(tracks)
     account = _index_captions(sources, material, tracks)
     if not tracks:
@@ -109,7 +109,6 @@ def survey_tracks(
     chosen: list[Chosen] = []
     dropped = Counter(candidate.dropped for candidate in candidates if candidate.dropped is not None)
     remaining = [candidate for candidate in candidates if candidate.dropped is None]
-    digests = set[bytes]()
 
     def courses() -> Iterator[Course]:
         """Yield the pedestrian's course of each track, and note in passing whether the track is chosen."""
@@ -121,12 +120,6 @@ def survey_tracks(
                 if kind not in tracks:
                     dropped[f"track {kind} not wanted"] += 1
                     continue
-                digest = digest_of_pictures(candidate.folder)
-                if digest in digests:  # runs of one seed have trajectories in common
-                    dropped["copy of another track"] += 1
-                    continue
-                if digest is not None:
-                    digests.add(digest)
                 captions = TrackCaptions(sources[candidate.source].captions, len(track))
                 chosen.append(Chosen(candidate, kind, (track.camera.width_px, track.camera.height_px), captions))
                 positions_m = track.targets_m - track.perturbation.target_m
@@ -153,8 +146,8 @@ def open_track(candidate: Candidate) -> Track:
 
 
 def keep_pairs(tracks: list[Chosen], cfg: ReleaseConfig) -> tuple[list[Chosen], Counter[str]]:
-    """Drop tracks whose other track is not released, unless `pairs` is `any` or only one kind of track is released;
-    return the others, and why how many are dropped."""
+    """Drop tracks whose other track is not released, unless `pairs` is `any` or only one kind of track is released,
+    and trajectories with the pictures of another one; return the others, and why how many are dropped."""
     groups = defaultdict[str, list[Chosen]](list)
     for track in tracks:
         groups[track.trajectory].append(track)
@@ -166,10 +159,17 @@ def keep_pairs(tracks: list[Chosen], cfg: ReleaseConfig) -> tuple[list[Chosen], 
                 got=", ".join(f"{track.track} {track.num_frames} frames" for track in group),
                 expected="one clean and one perturbed track of the same length",
             )  # fmt: skip
-    if cfg.pairs == "any" or len(cfg.tracks) < 2:
-        return tracks, Counter()
-    kept = [track for track in tracks if len(groups[track.trajectory]) == 2]
-    return kept, +Counter({NO_TWIN: len(tracks) - len(kept)})  # +: without a count of 0
+    num_needed = 1 if cfg.pairs == "any" else len(cfg.tracks)
+    complete = [group for group in groups.values() if len(group) >= num_needed]
+    kept, seen = list[Chosen](), set[tuple[bytes | None, ...]]()
+    for group in complete:
+        digests = tuple(digest_of_pictures(track.candidate.folder) for track in group)
+        if digests not in seen or None in digests:  # runs of one seed have trajectories in common
+            seen.add(digests)
+            kept += group
+    num_complete = sum(map(len, complete))
+    counts = Counter({NO_TWIN: len(tracks) - num_complete, "copy of another track": num_complete - len(kept)})
+    return kept, +counts  # without a count of 0
 
 
 def _check_sizes(tracks: list[Chosen]) -> None:
