@@ -48,6 +48,7 @@ def make_tree(root: Path, num_released: int) -> Path:
     digests = [{name: sha256_bytes((folder / name).read_bytes()) for name in os.listdir(folder)} for folder in pool]
     for number in range(max(1, num_released // (2 * FRAMES_RELEASED))):
         away_m = np.array([0.0, 1000.0 * number, 0.0])  # a walk of its own
+        chosen = np.random.default_rng(number).integers(NUM_POOL, size=NUM_POINTS).tolist()  # else it is a copy
         for variant in ("ORI", "aug_001"):
             trajectory = f"trajectory_{1_776_000_000 + number}"
             own = dataclasses.replace(
@@ -59,8 +60,8 @@ def make_tree(root: Path, num_released: int) -> Path:
             listed = {"trajectory.json": sha256_bytes((folder / "trajectory.json").read_bytes())}
             for i in range(NUM_POINTS):
                 (folder / frame_name(i)).mkdir(parents=True)
-                for name, digest in digests[i % NUM_POOL].items():
-                    os.link(pool[i % NUM_POOL] / name, folder / frame_name(i) / name)
+                for name, digest in digests[chosen[i]].items():
+                    os.link(pool[chosen[i]] / name, folder / frame_name(i) / name)
                     listed[f"{frame_name(i)}/{name}"] = digest
             (folder / CHECKSUMS).write_text(checksum_lines(listed))
     make_captions(root / "captions.jsonl", root / "tree")
