@@ -324,8 +324,10 @@ def run(
     header = {"map": box_map.name, "planner": cfg.planner, "seed": seed, "settings": cfg.recorded()}
     for trace in traces:
         if trace.not_held:
-            outcome = "dropped" if trace.drop_reason else f"flown in the style {cfg.styles_fallback}"
-            log.warning("%s: %s, because the drone does not hold its style: %s", trace.path_id, outcome, trace.not_held)
+            fallback = f", planned in the style {cfg.styles_fallback} instead" if trace.instead_of else ""
+            outcome = f"dropped ({trace.drop_reason})" if trace.drop_reason else "kept"
+            words = "%s: the drone does not hold its style (%s)%s; %s"
+            log.warning(words, trace.path_id, trace.not_held, fallback, outcome)
     write_traces(product, traces, header)
     write_bytes(picture, draw_trajectories(box_map, pedestrians, traces))
     times_ms = 1000.0 * np.array([record.seconds for record in records])  # not in the product, which is reproducible
