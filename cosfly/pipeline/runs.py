@@ -98,7 +98,7 @@ def _stage(name: str, folder: Path) -> StageSummary:
 
 # Measured in `cosfly run showcase` (docs/benchmarks.md; 2 cores, AMD EPYC, idle): 3 pedestrians, 858 frames of
 # 0.9216 Mpx, 804 windows by `rules`. Rates of frames are per million pixels; their disk space is that of `diverse`.
-BASIS = "`cosfly run showcase` on a 2-core machine (docs/benchmarks.md)"
+BASIS = "`cosfly run showcase` on a 2-core machine (docs/benchmarks.md), disk space of frames on `diverse`"
 
 
 class Rate(NamedTuple):
@@ -120,7 +120,8 @@ RATES = {
     "release": Rate("frames", 25.4 / 790.7, 2.3),
 }
 START_S = 2.0  # of a stage and its workers, which `showcase` hides: inspect and release of `quickstart` take 2 to 4 s
-WALK_MPS, PAVEMENT_MPS = 1.0, 0.7  # progress along the straight line from start to goal; with road_cost above 1
+# Progress along the straight line from start to goal; with road_cost above 1, 0.64 to 0.87 was measured.
+WALK_MPS, PAVEMENT_MPS = 1.0, 0.7
 PERSON_M, PERSON_DEPTH_M = 1.75, 0.45  # height of a person, and extent in the plane
 SMALL_SHARE = 0.2  # of the time
 
