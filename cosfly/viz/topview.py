@@ -26,7 +26,7 @@ COLORS: dict[str, tuple[int, int, int]] = {
 }  # fmt: skip
 OTHER_COLOR = (230, 90, 140)
 PAPER, INK, HALO = (250, 248, 242), (30, 30, 30), (255, 255, 255)
-FONT = cv2.FONT_HERSHEY_SIMPLEX
+FONT, TEXT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.55
 FRACTION_BITS = 4  # of a place's fixed-point coordinates, for OpenCV
 Color = Sequence[float]  # RGB, 0..255
 
@@ -95,8 +95,8 @@ def draw_dot(picture: np.ndarray, point: np.ndarray, radius_px: int, color: Colo
 
 
 def draw_text(
-    picture: np.ndarray, text: str, x: float, y: float, scale: float = 0.55, color: Color = INK, *, align: float = 0.0,
-    halo: Color | None = None,
+    picture: np.ndarray, text: str, x: float, y: float, scale: float = TEXT_SCALE, color: Color = INK, *,
+    align: float = 0.0, halo: Color | None = None,
 ) -> int:  # fmt: skip
     """Write text with its baseline at y; return the x of its end. align: 0 begins at x, 0.5 is centred, 1 ends at x."""
     width = cv2.getTextSize(text, FONT, scale, 1)[0][0]
@@ -113,9 +113,10 @@ def draw_labels(picture: np.ndarray, labels: Sequence[tuple[str, np.ndarray]]) -
     """Write names at their places, (2,) px; a name that would cover another name or place is moved, with a line."""
     frame = shapely.box(0, 0, picture.shape[1], picture.shape[0])
     taken: list[shapely.Geometry] = [shapely.Point(place).buffer(6) for _, place in labels]
-    offsets = [r * np.array([np.cos(a), np.sin(a)]) for r in range(0, 400, 8) for a in np.linspace(-np.pi, np.pi, 17)]
+    directions = [np.array([np.cos(angle), np.sin(angle)]) for angle in np.linspace(-np.pi, np.pi, 17)]
+    offsets = [away_px * direction for away_px in range(0, 400, 8) for direction in directions]  # the nearest first
     for k, (name, place) in enumerate(labels):
-        (width, height), _ = cv2.getTextSize(name, FONT, 0.55, 1)
+        (width, height), _ = cv2.getTextSize(name, FONT, TEXT_SCALE, 1)
         others = shapely.union_all(taken[:k] + taken[k + 1 :])
         half = np.array([width + 6, height + 8]) / 2
         middles = ((middle, shapely.box(*(middle - half), *(middle + half))) for middle in place + offsets)
