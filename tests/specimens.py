@@ -299,7 +299,7 @@ def _chunk(name: bytes, data: bytes) -> bytes:
 def png_around(
     packed: bytes, width: int, height: int, kind: int = 2, interlace: int = 0, piece: int = 1 << 20
 ) -> bytes:
-    """Give a PNG file around any bytes, whatever its header says of them; checksums are right.
+    """Return a PNG file around any bytes, whatever its header says of them; checksums are right.
 
     kind: the colour type; piece: bytes of a chunk of pixels.
     """
