@@ -46,10 +46,10 @@ def select_frames(num_points: int, num_frames: int, selection: Selection, window
 
 NAME_OF: dict[Split, SplitName] = {"train": "train", "val": "validation", "test": "test"}
 SPLIT_RULE = (
-    "whole walks (a walk: tracks of one town, in any of its builds, whose person is at the same places at the "
-    "same seconds), or whole towns; ranked by sha256 of the seed and the name, the first to test, the next to "
-    "validation, the rest to train, one at least for each split that has a share; fewer than splits fill train, "
-    "then validation"
+    "A walk is a pedestrian trajectory of a town: tracks of it show the person at the same places at the same "
+    "seconds. Walks or towns are ranked by the sha256 of the seed and their name: the first go to test, the next to "
+    "validation, the rest to train. Each split that has a share gets at least one. If there are fewer than splits, "
+    "train is filled first, then validation."
 )
 
 

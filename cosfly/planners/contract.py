@@ -289,7 +289,7 @@ class Scenario:
         return max(len(self.past_m) - 1, 0)
 
     def with_past(self, points_m: np.ndarray) -> np.ndarray:
-        """Return positions, (n, 3), that begin with the past ones."""
+        """Return positions, (n, 3), whose first ones are replaced by the past ones."""
         return np.vstack([self.past_m, points_m[len(self.past_m) :]])
 
     def key_frames(self, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
