@@ -1,6 +1,7 @@
 """Stage 3: pedestrian trajectories, speeds and crossings, and bystanders about a pedestrian."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shapely import LineString, box
 from specimens_planning import town_walks
 
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
@@ -17,9 +19,10 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths
 from cosfly.formats.roi import Roi
 from cosfly.geometry.axes import DT_S
 from cosfly.maps.boxlist import BoxList
+from cosfly.pedestrians.astar import _line_cost
 from cosfly.pedestrians.bystanders import bystanders_of, gaps_m
 from cosfly.pedestrians.speed_model import PACES, TimedRoute, take_pace
-from cosfly.pedestrians.stage import PedestriansConfig, make_pedestrian, run, walkable_ground
+from cosfly.pedestrians.stage import PedestriansConfig, follow_route, make_pedestrian, run, walkable_ground
 from cosfly.pedestrians.walkable import count_on_road
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load, shipped
@@ -95,6 +98,65 @@ def test_a_walk_keeps_every_promise(number, dt_s):
     assert not ground.grid.occupied[y, x].any()
     x, y = ground.grid.cells_at(path.polyline_m).T
     assert (ground.parts[y, x] == ground.parts[y[0], x[0]]).all()
+
+
+def test_a_line_crosses_the_cells_that_geometry_says():
+    rng = np.random.default_rng(5)
+    costs = np.array([1, 9])
+    num_blocked = 0
+    for _ in range(300):
+        free, classes = rng.random((7, 7)) < 0.9, rng.integers(0, 2, (7, 7)).astype(np.uint8)
+        start, end = rng.integers(0, 7, (2, 2))
+        free[start[1], start[0]] = free[end[1], end[0]] = True
+        if (start == end).all():
+            continue
+        line = LineString([start, end])
+        crossed = [
+            (x, y) for x in range(7) for y in range(7) if line.intersects(box(x - 0.5, y - 0.5, x + 0.5, y + 0.5))
+        ]
+        if all(free[y, x] for x, y in crossed):
+            through = [  # longer than a touched corner
+                (x, y) for x, y in crossed if line.intersection(box(x - 0.5, y - 0.5, x + 0.5, y + 0.5)).length > 1e-9
+            ]
+            expected = np.mean([costs[classes[y, x]] for x, y in through]) * line.length
+        else:
+            expected = np.inf
+            num_blocked += 1
+        assert _line_cost(start, end, free, classes, costs) == pytest.approx(expected)
+    assert 50 < num_blocked < 250
+
+
+def test_people_walk_straight_where_the_ground_allows_it(tmp_path):
+    """Along a turned street, round a wall and across a road of a higher cost."""
+    street = ("Sidewalks", (0, 0, -0.1), (60, 6, 0.1), 20.0)
+    walls = [("Walls", (x, y, 1.0), (0.3, 4.5, 1.0), 20.0) for x, y in ((-20, -9), (18, 9))]
+    box_map = map_of(street, ("Roads", (0, 0, -0.05), (3, 20, 0.06)), *walls)
+    speeds = {}
+    for route in ("straight", "cells"):
+        cfg = PedestriansConfig(route=route, road_cost=9, safety_radius_m=0.0)
+        ground = walkable_ground(box_map, cfg)
+        means = []
+        for k in range(6):
+            rng = rng_for(0, "pedestrians", str(k))
+            start = ground.sample_start(rng)
+            (goal,) = ground.sample_goals(start, 100, 200, rng)
+            cells = ground.route(start, goal)
+            waypoints_m = ground.waypoints_m(cells)
+            np.testing.assert_allclose(waypoints_m[[0, -1]], ground.grid.centers_of(cells[[0, -1]]))
+            pieces_m = np.linalg.norm(np.diff(waypoints_m, axis=0), axis=1)
+            assert 0.3 < pieces_m.min() <= pieces_m.max() < 0.76
+            dense_m = np.concatenate([a + np.linspace(0, 1, 50)[:, None] * (b - a) for a, b in pairwise(waypoints_m)])
+            x, y = ground.grid.cells_at(dense_m).T
+            assert ground.walkable[y, x].all()
+            costs_m = [np.repeat(pieces_m / 50, 50) @ ground.costs[ground.footing[y, x]]]
+            steps = ground.costs[ground.footing[cells[:, 1], cells[:, 0]]]
+            costs_m.append(np.linalg.norm(np.diff(cells, axis=0), axis=1) @ (steps[1:] + steps[:-1]) / 2 * 0.5)
+            assert costs_m[0] <= costs_m[1] + 2.0  # the cells of a line are counted whole
+            walk = follow_route("p", waypoints_m, 0.0, cfg, np.random.default_rng(0), np.random.default_rng(0), "walk")
+            means.append(pieces_m.sum() / walk.time_s[-1])
+        speeds[route] = np.mean(means)
+    assert speeds["cells"] < 0.7
+    assert speeds["straight"] > 1.0
 
 
 def test_the_stage_writes_paths_report_and_picture(tmp_path):

@@ -1,4 +1,4 @@
-"""The cheapest route over a grid of free cells: exact A* with octile costs and no corner cutting.
+"""The cheapest route over a grid of free cells: exact A* with octile costs and no corner cutting; and its corners.
 
 A straight step costs 1, a diagonal one sqrt 2, and a diagonal step needs both straight neighbours free (sec:step3).
 With several classes of cells, a step costs this times the mean cost of its two cells. Path costs are
@@ -20,6 +20,9 @@ _STEP_X = np.array([1, 0, -1, 0, 1, -1, -1, 1], dtype=np.int64)
 _STEP_Y = np.array([0, 1, 0, -1, 1, 1, -1, -1], dtype=np.int64)
 
 UNIFORM = np.ones(1, dtype=np.int64)
+
+CORNER_COST = 1.0  # of a corner of a straightened route, in cell widths: fewer corners are worth a small detour
+LONGEST_LINE = 200  # steps of a route that one straight line may replace
 
 _UNSEEN, _OPEN, _CLOSED = 0, 1, 2
 STRAIGHT, DIAGONAL = range(2)  # columns of the steps
@@ -110,3 +113,62 @@ def _search(free, origin, target, state, steps, from_direction, classes, costs, 
             to_go = straight_to_go + diagonal_to_go * SQRT2
             heappush(heap, (total, to_go, neighbour))
     return False
+
+
+def corners_of(cells: np.ndarray, free: np.ndarray, classes: np.ndarray, costs: np.ndarray) -> np.ndarray:
+    """Return the cells of a route, (k, 2), between which it can run straight, (m, 2) with both ends.
+
+    They are those of least cost, by dynamic programming: a line costs its length times the mean cost of the cells that
+    it crosses, a corner CORNER_COST. Without this a route in a direction between the eight of a grid is a staircase.
+
+    Args:
+        free, classes, costs: As for `find_route`.
+    """
+    previous = _straighten(cells, free, classes, costs)
+    corners = [len(cells) - 1]
+    while corners[-1]:
+        corners.append(int(previous[corners[-1]]))
+    return cells[corners[::-1]]
+
+
+@njit(cache=True)
+def _straighten(cells, free, classes, costs):  # pragma: no cover (compiled)
+    """Return for each cell the one from which the cheapest chain of lines reaches it, (k,)."""
+    best = np.full(len(cells), np.inf)
+    best[0] = 0.0
+    previous = np.zeros(len(cells), dtype=np.int64)
+    for j in range(1, len(cells)):
+        for i in range(max(0, j - LONGEST_LINE), j):
+            cost = best[i] + CORNER_COST + _line_cost(cells[i], cells[j], free, classes, costs)
+            if cost < best[j] - 1e-9:  # an earlier one in a tie up to rounding
+                best[j], previous[j] = cost, i
+    return previous
+
+
+@njit(cache=True)
+def _line_cost(start, end, free, classes, costs):  # pragma: no cover (compiled)
+    """Return the cost of a straight line between the centres of two cells, infinite if it touches one that is not free.
+
+    Both cells at a corner that it passes through must be free, as for a diagonal step.
+    """
+    x, y = start
+    length_x, length_y = abs(end[0] - x), abs(end[1] - y)
+    step_x, step_y = 1 if end[0] > x else -1, 1 if end[1] > y else -1
+    total, num_cells = costs[classes[y, x]], 1
+    # Border k + 1/2 of the cells along an axis is passed at the share (k + 1/2) / length of the line.
+    borders_x = borders_y = 0
+    while x != end[0] or y != end[1]:
+        next_x, next_y = (1 + 2 * borders_x) * length_y, (1 + 2 * borders_y) * length_x
+        if next_x == next_y and not (free[y, x + step_x] and free[y + step_y, x]):
+            return np.inf
+        if next_x <= next_y:
+            x += step_x
+            borders_x += 1
+        if next_y <= next_x:
+            y += step_y
+            borders_y += 1
+        if not free[y, x]:
+            return np.inf
+        total += costs[classes[y, x]]
+        num_cells += 1
+    return total / num_cells * math.sqrt(length_x**2 + length_y**2)

@@ -135,11 +135,11 @@ def _draw_trip(
     places = ground.sample_goals((int(target_cell[0]), int(target_cell[1])), low_cells, high_cells, rng)
     if not places:
         return None
-    cells = _route_through(places[0], ground, cfg, rng)
-    if cells is None:
+    waypoints_m = _route_through(places[0], ground, cfg, rng)
+    if waypoints_m is None:
         return None
     pace = PACES[draw_by_share(cfg.pace, rng)]
-    route = timed_route(ground.grid.centers_of(cells), pace, cfg, rng, rng)
+    route = timed_route(waypoints_m, pace, cfg, rng, rng)
     route = replace(route, limits_mps=route.limits_mps * rng.uniform(*SPEED_FACTORS))
     # The trajectory after a head start of at most its duration needs two durations; 3 leave a margin.
     while route.sample(3.0 * target.time_s[-1:])[0][0] >= route.along_m[-1]:
@@ -155,7 +155,7 @@ def _draw_trip(
 def _route_through(
     place: tuple[int, int], ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator
 ) -> np.ndarray | None:
-    """Return the cells of a route through a cell, (k, 2), between ends on opposite sides; None without any end."""
+    """Return waypoints, (k, 2) m, of a route through a cell between ends on opposite sides; None without any end."""
     reach_cells = cfg.others_reach_m / cfg.resolution_m
     ends = ground.sample_goals(place, 0.5 * reach_cells, reach_cells, rng, 1 + OPPOSITE_TRIES)
     if not ends:
@@ -164,6 +164,6 @@ def _route_through(
     candidates = offsets[1:]
     # Cosines of the angles to the first end, times its distance.
     cosines = candidates @ offsets[0] / np.linalg.norm(candidates, axis=1)
-    leg_back = ground.route(place, ends[0])
-    leg_ahead = ground.route(place, ends[1 + int(np.argmin(cosines))])
+    far_ends = ends[0], ends[1 + int(np.argmin(cosines))]
+    leg_back, leg_ahead = (ground.waypoints_m(ground.route(place, end)) for end in far_ends)
     return np.concatenate([leg_back[:0:-1], leg_ahead])

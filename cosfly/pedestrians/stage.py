@@ -1,8 +1,12 @@
 """Stage `pedestrians`: trajectories over the free ground of a simplified map (Step 3 of the paper, sec:step3).
 
-Speed follows the literal formulas on the A* polyline, one waypoint per cell, so that curvature slows a pedestrian only
+Speed follows the literal formulas on the route, one waypoint per cell width, so that curvature slows a pedestrian only
 in the one or two steps next to a corner. Without collinear waypoints the low speed of a corner would extend over the
 straight segment behind it (0.92 instead of 1.07 m/s on the same 40 routes of a test town).
+
+The route is straightened first. At a turn of 45 degrees from cell to cell the formulas give 0.16 m/s, and a route along
+a street that is not parallel to an axis turns every few cells: on 20 routes of Delft, 35 % of the positions were slower
+than 0.3 m/s, and 1 % are with straight lines.
 """
 
 import colorsys
@@ -108,7 +112,8 @@ def _draw_route(
         if route_cost(cells) > cfg.max_detour * np.hypot(*(cells[-1] - cells[0])):
             rejected["detour"] += 1
             continue
-        return ground.grid.centers_of(cells), rejected
+        with timed(seconds, "astar"):
+            return ground.waypoints_m(cells), rejected
     raise NoPathError(
         "no random pair of start and goal has a suitable route", where=path_id,
         got=f"{cfg.num_retries + 1} tries: {rejected['no_goal']} without a goal, {rejected['detour']} with a long "
@@ -152,11 +157,11 @@ def report(
     rows = [_report_row(ground, path, rejected) for path, rejected in zip(paths, retries, strict=True)]
     sums = {
         key: sum(row[key] for row in rows)
-        for key in ("cells", "points", "on_carriageway", "on_crossings", "length_m", "duration_s")
+        for key in ("waypoints", "points", "on_carriageway", "on_crossings", "length_m", "duration_s")
     }
     total = {
         "paths": len(rows),
-        **{key: sums[key] for key in ("cells", "points", "on_carriageway", "on_crossings")},
+        **{key: sums[key] for key in ("waypoints", "points", "on_carriageway", "on_crossings")},
         "on_carriageway_share": round(sums["on_carriageway"] / sums["points"], 4),
         "length_m": round(sums["length_m"], 3),
         "duration_s": sums["duration_s"],
@@ -173,7 +178,7 @@ def _report_row(ground: WalkableGround, path: PedestrianTrajectory, rejected: di
     return {
         "id": path.path_id,
         **pace_field(path.pace),
-        "cells": len(path.polyline_m),
+        "waypoints": len(path.polyline_m),
         "length_m": round(path_m, 3),
         "straight_m": round(float(np.linalg.norm(path.polyline_m[-1] - path.polyline_m[0])), 3),
         "points": len(path.time_s),

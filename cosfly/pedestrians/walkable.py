@@ -26,7 +26,8 @@ from cosfly.formats.pedestrian_paths import PLAIN_PACE, PedestrianTrajectory
 from cosfly.formats.roi import Roi
 from cosfly.geometry import grid as grids
 from cosfly.geometry.axes import DT_S
-from cosfly.pedestrians.astar import find_route
+from cosfly.geometry.trajectory_metrics import distances_along_m
+from cosfly.pedestrians.astar import corners_of, find_route
 from cosfly.pedestrians.speed_model import PACES, SLOWEST_SPEED_MPS
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError, NoPathError, nearest
@@ -71,6 +72,11 @@ class PedestriansConfig(Config):
     ground: Literal["anywhere", "surfaces", "paved"] = Field(
         "surfaces",
         description="walkable ground: anywhere; surfaces: ground boxes, if the map has them; paved: paved ones only",
+    )
+    route: Literal["straight", "cells"] = Field(
+        "straight",
+        description="straight: straight lines where the ground allows them; cells: from cell to cell as in the paper, "
+        "where people almost stop at each turn, and streets that are not parallel to an axis are full of turns",
     )
     road_cost: int = Field(
         1, ge=1, le=100, description="cost of a metre of carriageway off crossings, in metres of pavement; 1: all "
@@ -127,6 +133,7 @@ class WalkableGround:
     footing: np.ndarray  # (ny, nx) uint8: PAVED, OPEN, CROSSING or ROAD
     z_m: float  # height of the ground
     costs: np.ndarray  # (NUM_FOOTINGS,) int64, of a step of a route on each footing
+    is_straight: bool  # whether waypoints lie on straight lines where the ground allows them, else on cells
     is_in_roi: np.ndarray | None = None  # (ny, nx) bool; None without a region of interest
     counts: dict[str, Any] = field(default_factory=dict)  # as in `pedestrians_report.json`
 
@@ -180,6 +187,16 @@ class WalkableGround:
         cells = find_route(self.walkable, start, goal, self.footing, self.costs)
         assert cells is not None, "two cells of one part have no route between them"
         return cells
+
+    def waypoints_m(self, cells: np.ndarray) -> np.ndarray:
+        """Return waypoints along a route of cells, (k, 2), about a cell width apart, (m, 2) m."""
+        if not self.is_straight:
+            return self.grid.centers_of(cells)
+        corners_m = self.grid.centers_of(corners_of(cells, self.walkable, self.footing, self.costs))
+        along_m = distances_along_m(corners_m)
+        counts = np.maximum(1, np.round(np.diff(along_m) / self.grid.resolution_m)).astype(int)
+        at_m = np.interp(np.arange(counts.sum() + 1), np.concatenate([[0], np.cumsum(counts)]), along_m)
+        return np.column_stack([np.interp(at_m, along_m, corners_m[:, axis]) for axis in (0, 1)])
 
 
 @contextmanager
@@ -240,7 +257,8 @@ def walkable_ground(
         costs = costs_of(cfg.road_cost)
         footing = footing_of(box_map, grid)
     counts |= component_counts
-    ground = WalkableGround(grid, inflated, parts, footing, box_map.ground_z_m, costs, is_in_roi, counts)
+    is_straight = cfg.route == "straight"
+    ground = WalkableGround(grid, inflated, parts, footing, box_map.ground_z_m, costs, is_straight, is_in_roi, counts)
     if not ground.may_end.any():
         what = "all walkable ground is road, but pedestrian trajectories must start and end off the road"
         got = f"{counts['cells_used']} walkable cells, all Roads"
