@@ -132,11 +132,15 @@ def surface_kinds(box_map: BoxMap, kinds: Collection[int], *, like: OccupancyGri
     kinds: as for `surface`; of kinds in one plane, to a centimetre, the higher layer counts.
     """
     boxes = _surfaces(box_map, kinds)
-    tops_m = np.round(boxes.maxs[:, 2] - boxes.ground_z_m, 2)
-    boxes = boxes.select(np.lexsort((_LAYER_OF[boxes.kinds], tops_m)))
+    boxes = boxes.select(upward_order(boxes))
     cell_kinds = np.zeros(like.occupied.shape, dtype=np.uint8)
     _mark(boxes, like, cell_kinds, boxes.kinds, touch=0.5 - TOUCH_M)
     return cell_kinds
+
+
+def upward_order(box_map: BoxMap) -> np.ndarray:
+    """Return the rows of boxes by their tops to a centimetre, and in one plane by the layer of their kinds, (n,)."""
+    return np.lexsort((_LAYER_OF[box_map.kinds], np.round(box_map.maxs[:, 2] - box_map.ground_z_m, 2)))
 
 
 def _mark(

@@ -120,6 +120,8 @@ class SkippedEntries:
             raise InputError.of_all(problems, where=path, expected=expected)
         for problem in problems[:MOST_NAMED]:
             log.warning("%s: skipped: %s", path.name, problem)
+        if len(problems) > MOST_NAMED:
+            log.warning("%s: skipped for %d other reasons", path.name, len(problems) - MOST_NAMED)
 
 
 def listed(places: list[str], problem: str) -> str:

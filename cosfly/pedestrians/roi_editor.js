@@ -12,7 +12,7 @@ const LABELS = {
     polygon: "polygon", holeOf: "hole", open_ring: "open", points: "points",
     keys: "Click: vertex. Drag: move. Double click on an edge: new vertex. Wheel: zoom; right drag: pan. Keys: arrows move the vertex by a cell (Shift: ten) or pan; N, B next and previous vertex; " +
       "Space: vertex at the cross; + - zoom; Esc: clear the selection.",
-    occupied: "occupied", margin: "safety margin", unused: "free, not walkable", free: "walkable", in_region: "in the region", walkable: "walkable, in the region", outside: "outside the map", cell: "cell",
+    occupied: "occupied", margin: "safety margin", unused: "free, not used", free: "walkable", in_region: "in the region", walkable: "walkable, in the region", outside: "outside the map", cell: "cell",
     region: "cells in the region", walkable_cells: "walkable cells", components: "components", large: "large enough", largest: "largest", used: "cells used",
     saved: "saved to", unsaved: "not saved", whole: "the whole map: no polygon is closed", few: "a polygon needs three vertices", nowhere: "a hole must begin inside a closed polygon",
     not_saved: "close the open polygon first", drawing: "click to add vertices, then close the polygon", lost: "the server of the editor does not answer; start the editor again", large_file: "the file is too large",
@@ -22,7 +22,7 @@ const LABELS = {
     close: "闭合多边形", undo: "撤销", redo: "重做", remove: "删除顶点", discard: "删除多边形", vertex: "顶点", open: "打开文件", save: "保存",
     polygon: "多边形", holeOf: "孔洞", open_ring: "未闭合", points: "个点",
     keys: "单击：加顶点；拖动：移动；双击边：插入顶点；滚轮：缩放；右键拖动：平移。按键：方向键移动顶点一格（Shift：十格）或平移；N、B 下一个/上一个顶点；空格：在十字处加顶点；+ - 缩放；Esc：取消选择。",
-    occupied: "占用", margin: "安全边距", unused: "空闲但不可行走", free: "可行走", in_region: "区域内", walkable: "区域内可行走", outside: "地图之外", cell: "栅格",
+    occupied: "占用", margin: "安全边距", unused: "空闲但未使用", free: "可行走", in_region: "区域内", walkable: "区域内可行走", outside: "地图之外", cell: "栅格",
     region: "区域内栅格", walkable_cells: "可行走栅格", components: "连通块", large: "足够大", largest: "最大", used: "使用的栅格",
     saved: "已保存到", unsaved: "未保存", whole: "整张地图：没有闭合的多边形", few: "多边形至少需要三个顶点", nowhere: "孔洞须从已闭合的多边形内开始",
     not_saved: "请先闭合多边形", drawing: "单击添加顶点，然后闭合多边形", lost: "编辑器服务没有应答：它还在运行吗？", large_file: "文件太大",

@@ -15,6 +15,7 @@ import shapely
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KIND_NAMES
 from cosfly.geometry.axes import box_corners
+from cosfly.geometry.grid import upward_order
 
 # RGB, softer than CARLA's palette, which is made for masks. Other kinds: OTHER_COLOR.
 COLORS: dict[str, tuple[int, int, int]] = {
@@ -64,7 +65,7 @@ def draw_map(box_map: BoxMap, view: TopView) -> np.ndarray:
     """Draw a map from above, low boxes first, high ones lighter; (height, width, 3) uint8 RGB."""
     picture = np.full((*view.size_px[::-1], 3), PAPER, dtype=np.uint8)
     tops = box_map.centers[:, 2] + box_map.half_extents[:, 2]
-    for row in np.argsort(tops, kind="stable"):
+    for row in upward_order(box_map):
         outline = view.pixels(footprint(box_map, row))
         color = np.array(COLORS.get(KIND_NAMES[int(box_map.kinds[row])], OTHER_COLOR), dtype=np.float64)
         color += (255 - color) * np.clip(tops[row] / 80.0, 0.0, 0.5)
