@@ -47,9 +47,9 @@ def select_frames(num_points: int, num_frames: int, selection: Selection, window
 NAME_OF: dict[Split, SplitName] = {"train": "train", "val": "validation", "test": "test"}
 SPLIT_RULE = (
     "A walk is a pedestrian trajectory of a town: tracks of it show the person at the same places at the same "
-    "seconds. Walks or towns are ranked by the sha256 of the seed and their name: the first go to test, the next to "
-    "validation, the rest to train. Each split that has a share gets at least one. If there are fewer than splits, "
-    "train is filled first, then validation."
+    "seconds. Walks or towns are ranked by the sha256 of the seed and their name, without the name of the run: the "
+    "first go to test, the next to validation, the rest to train. Each split that has a share gets at least one. If "
+    "there are fewer than splits, train is filled first, then validation."
 )
 
 

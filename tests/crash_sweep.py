@@ -30,8 +30,8 @@ from cosfly.planners.stage import warm_up
 
 TINY = (
     "maps.synthetic.size_m=110", "maps.synthetic.num_blocks=1", "pedestrians.num_paths=1",
-    "pedestrians.min_distance_m=8", "pedestrians.max_distance_m=12", "render.width_px=160", "render.height_px=90",
-    "'render.fovs_deg=[60]'", "inspect.legible_min=0", "caption.window.stride=4", "workers=1",
+    "pedestrians.min_distance_m=8", "pedestrians.max_distance_m=12", "pedestrians.route=cells", "render.width_px=160",
+    "render.height_px=90", "'render.fovs_deg=[60]'", "inspect.legible_min=0", "caption.window.stride=4", "workers=1",
 )  # fmt: skip
 
 

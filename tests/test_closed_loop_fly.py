@@ -37,7 +37,7 @@ TINY = (
     "--set pedestrians.min_distance_m=25 --set pedestrians.max_distance_m=35 --set render.width_px=160 "
     "--set render.height_px=90 --set render.fovs_deg=[70] --seed 4"
 )
-LONG = "--set fly.tree=false --set fly.most_decisions=30"
+LONG = "--set fly.tree=false --set fly.most_decisions=30 --set fly.lead_frames=6"
 SHORT = "--workers 1 --set fly.most_decisions=6 --set fly.tree=false"
 
 

@@ -377,13 +377,15 @@ def test_walks_agree_with_a_slow_plain_comparison():
 )  # fmt: skip
 def test_splits_cover_all_and_none_is_empty(num_groups, val, test, seed):
     shares = {"val": val, "test": test}
-    names = [f"walk_{i}" for i in range(num_groups)]
+    names = [f"run/Town/walk_{i}" for i in range(num_groups)]
     split_of = assign_splits(names, shares, seed)
     assert set(split_of) == set(names)
     counts = Counter(split_of.values())
     assert set(counts) == {split for split in SPLITS if split == "train" or shares[split] > 0}
     assert abs(counts["val"] - val * num_groups) <= 1
     assert split_of == assign_splits(list(reversed(names)) * 2, shares, seed)  # order, repeats
+    renamed = assign_splits([name.replace("run", "again") for name in names], shares, seed)
+    assert {name.replace("again", "run"): split for name, split in renamed.items()} == split_of
     if num_groups > 30 and min(val, test) > 0.05:
         assert split_of != assign_splits(names, shares, seed + 1)
 

@@ -334,7 +334,7 @@ def test_the_page_of_a_captioning_run_shows_forged_captions(tree, tmp_path):
     done = caption(CaptionConfig(), tree, tmp_path / "caption").parent
     report = read_model(done / "caption_report.json", CaptionReport, REPORT_FORMAT, tree=done)
     cards = [forged(Caption, card, 8) for card in list(read_captions(done / "captions.jsonl"))[:3]]
-    page = page_html(forged(CaptionReport, report, 1), cards, {}, BudgetConfig(), HOSTILE)
+    page = page_html(forged(CaptionReport, report, 1), cards, {}, Path("answers"), BudgetConfig(), HOSTILE)
     check_page(page, (done / "report.html").read_text(encoding="utf-8") + '<div class="gone"></div>')
 
 

@@ -280,7 +280,8 @@ class RunProgress:
         self.windows = Tally()  # of this run
         self.num_repaired = 0
         self._num_recorded = 0  # windows of this run before its first new answer: earlier answers sufficed
-        self._start_s = time.monotonic()
+        self._start_s = self._answered_s = time.monotonic()
+        self._num_answers = 0
         self._totals_before = budget.totals
 
     def skip(self, num_windows: int) -> None:
@@ -305,12 +306,18 @@ class RunProgress:
 
     def show(self, num_windows: int = 0) -> None:
         """Move the progress bar by so many windows, and update its text."""
+        if self._answers["answers"] != self._num_answers:
+            self._num_answers, self._answered_s = self._answers["answers"], time.monotonic()
         self._advance(num_windows, self.figures())
 
     @property
     def _answers(self) -> Counter[str]:
         """The answers of this run and their tokens."""
         return self.budget.totals - self._totals_before
+
+    def _waiting(self) -> str:
+        waiting_s = time.monotonic() - self._answered_s
+        return f", waiting for {duration(waiting_s)}" if waiting_s >= SECONDS_BETWEEN_LINES else ""
 
     def figures(self) -> str:
         """Return the figures of the run as a text."""
@@ -321,12 +328,15 @@ class RunProgress:
             f"accepted {windows.kept:,} (repaired {self.num_repaired:,})",
             f"dropped {windows.dropped.total():,}" + (f" ({reasons})" if reasons else ""),
             f"no answer {windows.failed.total():,}",
-            f"answers {answers['answers']:,} in {duration(elapsed_s)}",
+            f"answers {answers['answers']:,} in {duration(elapsed_s)}" + self._waiting(),
             f"tokens {answers['prompt_tokens']:,} in {answers['completion_tokens']:,} out",
         ]
         if prices.price_prompt or prices.price_completion:
             figures.append(f"cost {prices.cost(answers['prompt_tokens'], answers['completion_tokens']):.2f}")
         if num_asked := windows.input - self._num_recorded:
-            figures.append(f"{num_asked / elapsed_s:.2f} windows/s")
+            is_slow = num_asked < elapsed_s
+            figures.append(
+                f"{elapsed_s / num_asked:.0f} s per window" if is_slow else f"{num_asked / elapsed_s:.1f} windows/s"
+            )
             figures.append(f"{duration(self.num_left * elapsed_s / num_asked)} left")
         return ", ".join(figures)

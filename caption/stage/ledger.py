@@ -11,7 +11,7 @@ from pydantic import BaseModel, PlainSerializer
 from cosfly.formats.captions import TOKENS, Caption, TeacherRecord, Usage, ValueCounts
 from cosfly.formats.frames import frame_name
 from cosfly.formats.places import flight_of
-from cosfly.llm.answers import BudgetConfig
+from cosfly.llm.answers import Answer, BudgetConfig, journal_of
 from cosfly.runtime.io import read_text, sha256_bytes
 from cosfly.runtime.json_io import FileFormat
 from cosfly.runtime.run_dir import Tally
@@ -49,6 +49,16 @@ def explain_drops(dropped: Mapping[str, int]) -> str:
     """Return the three most common reasons with their counts and meanings."""
     reasons = list(most_common(dropped).items())[:3]
     return "; ".join(f"{count} {reason}: {REASONS[reason]}" for reason, count in reasons)
+
+
+def problems_of(caption: Caption) -> list[tuple[str, str]]:
+    """Return what is wrong with the answers of a window: kinds of problems, and their words."""
+    checks = caption.checks
+    problems = [("structure", checks.structure), ("refusal", checks.refusal)]
+    problems += [("answer rejected", reason) for reason in checks.refused or ()]
+    problems += [("contradicted", text) for text in checks.contradictions or ()]
+    problems.append(("languages", checks.bilingual))
+    return [(kind, words) for kind, words in problems if words not in (None, "ok")]
 
 
 # --- the report -------------------------------------------------------------------------------------------------------
@@ -183,13 +193,21 @@ STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
 
 
 def page_html(
-    report: CaptionReport, cards: Sequence[Caption], folders: Mapping[str, Path], budget: BudgetConfig, name: str
-) -> str:
-    """Return the page of a run with this name. cards: Captions to show. folders: Of the tracks by id, for pictures."""
+    report: CaptionReport, cards: Sequence[Caption], folders: Mapping[str, Path], answers: Path, budget: BudgetConfig,
+    name: str,
+) -> str:  # fmt: skip
+    """Return the page of a run.
+
+    Args:
+        cards: Captions to show.
+        folders: Of the tracks by id, for pictures.
+        answers: The folder of the journals.
+        name: Of the run.
+    """
     return page(
         "caption/stage/report.html", title=name, style=STYLE, report=report, meanings=VERDICTS,
         values=tuple(ValueCounts.model_fields), language_names=LANGUAGE_NAMES, most_common=most_common,
-        tokens=TOKENS, cost=_cost(report, budget), cards=[_card(caption, folders) for caption in cards],
+        tokens=TOKENS, cost=_cost(report, budget), cards=[_card(caption, folders, answers) for caption in cards],
     )  # fmt: skip
 
 
@@ -213,10 +231,17 @@ def _cost(report: CaptionReport, budget: BudgetConfig) -> list[tuple[str, str]]:
     return rows
 
 
-def _card(caption: Caption, folders: Mapping[str, Path]) -> dict[str, Any]:
-    """Return a caption with the indices and thumbnails of its last frames, None in place of a missing thumbnail."""
+def _card(caption: Caption, folders: Mapping[str, Path], answers: Path) -> dict[str, Any]:
+    """Return a caption with the indices and thumbnails of its last frames, None in place of a missing thumbnail, its
+    problems, and the recorded answers of a dropped window."""
     pictures: dict[int, str | None] = dict.fromkeys(caption.window[-CARD_FRAMES:])
     if folder := folders.get(flight_of(caption.sample_id)):
         for index in pictures:
             pictures[index] = thumbnail(folder / frame_name(index), PICTURE_WIDTH_PX, jpeg_quality=75)
-    return {"caption": caption, "pictures": list(pictures.items())}
+    texts = []
+    if caption.status == "dropped":
+        journal = journal_of(answers, flight_of(caption.sample_id)).read_as(Answer.model_validate)
+        texts = [answer.text for answer in journal if answer.sample_id == caption.sample_id]
+    return {
+        "caption": caption, "pictures": list(pictures.items()), "problems": problems_of(caption), "answers": texts,
+    }  # fmt: skip

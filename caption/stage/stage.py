@@ -114,7 +114,7 @@ def _write_report(
     report.finish(outcome.tracks, len(outcome.unanswered), outcome.judge_usage)
     write_model(stage.path / REPORT, report, REPORT_FORMAT)
     folders = {track.name: track.folder for track in tracks}
-    html = page_html(report, cards.chosen(), folders, cfg.budget, run_name(stage.path))
+    html = page_html(report, cards.chosen(), folders, stage.path / ANSWERS, cfg.budget, run_name(stage.path))
     write_bytes(stage.path / PAGE, html.encode())
     return report
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from caption.schema import CaptionConfig
 from caption.stage.asking import ANSWERS
-from caption.stage.ledger import REASONS
+from caption.stage.ledger import REASONS, problems_of
 from caption.stage.stage import open_stage
 from caption.stage.tracks import find_inputs
 from caption.stage.window_loop import MOST_ASKS, caption_window
@@ -121,12 +121,9 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
 
 def _outcome_lines(caption: Caption) -> Iterator[str]:
     """Yield the lines about a caption: its status, what was checked, and its texts."""
-    reason, checks = caption.drop_reason, caption.checks
+    reason = caption.drop_reason
     yield caption.status if reason is None else f"dropped because of {reason}: {REASONS[reason]}"
-    facts = [("label", caption.label), ("verdict", caption.verdict)]
-    facts += [("structure", checks.structure), ("refusal", checks.refusal)]
-    facts += [("answer rejected", reason) for reason in checks.refused or ()]
-    facts += [("contradicted", text) for text in checks.contradictions or ()]
+    facts = [("label", caption.label), ("verdict", caption.verdict), *problems_of(caption)]
     for language, answer in (("en", caption.en), ("zh", caption.zh)):
         if answer is not None:
             facts += [(language, text) for text in answer.model_dump().values()]

@@ -80,10 +80,7 @@ def print_run(run: Path, *, with_settings: bool = False) -> None:
     for stage in summary.stages:
         seconds = "" if stage.seconds is None else f"{stage.seconds:.1f}"
         disk = size(stage.size_bytes) if stage.size_bytes else ""
-        items = "" if stage.tally is None else str(stage.tally)
-        if stage.state == "begun":
-            items += " so far"
-        rows.append((stage.name, stage.state, items, seconds, disk))
+        rows.append((stage.name, stage.state, stage.items, seconds, disk))
     total = sum(stage.size_bytes for stage in summary.stages)
     typer.echo(f"{run}: {summary.cfg.name}, {summary.progress} stages complete, {size(total)}")
     head = ("stage", "state", "items", "seconds", "on disk")

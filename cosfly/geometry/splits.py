@@ -113,14 +113,19 @@ def _near_pairs(courses: list[Course]) -> list[tuple[str, str]]:
 def assign_splits(groups: Iterable[str], fractions: Mapping[Split, float], seed: int) -> dict[str, Split]:
     """Assign groups to splits: group -> split.
 
-    Groups are ranked by a hash of (seed, group). The first go to test, the next to val, the others to train; the
-    numbers are the rounded fractions, and at least one for each split that has a share. With fewer groups than splits,
-    train gets one first, then val.
+    Groups are ranked by a hash of (seed, group), without the run of a walk, so that equal runs in two folders have
+    equal splits. The first go to test, the next to val, the others to train; the numbers are the rounded fractions, and
+    at least one for each split that has a share. With fewer groups than splits, train gets one first, then val.
 
     Args:
         fractions: shares of `val` and `test`, together below 1; 0 or none: no such split.
     """
-    ranked = sorted(set(groups), key=lambda group: hashlib.sha256(f"{seed}/distill.split/{group}".encode()).digest())
+
+    def rank(group: str) -> tuple[bytes, str]:
+        name = group.split("/", 1)[-1]  # of `run/town/trajectory`, or of a town
+        return hashlib.sha256(f"{seed}/distill.split/{name}".encode()).digest(), group
+
+    ranked = sorted(set(groups), key=rank)
     requested = [split for split in SPLITS if split == "train" or fractions.get(split, 0.0) > 0]
     if len(ranked) < len(requested):
         return dict(zip(ranked, requested, strict=False))

@@ -72,6 +72,13 @@ def answer_key(model: str, request: Request) -> str:
     return sha256_bytes(dump_json(parts).encode())
 
 
+def journal_of(folder: Path, track: str) -> Journal:
+    """Return the journal of a track's answers; a name that no file can have is replaced by its digest."""
+    is_plain = _PLAIN_NAME.fullmatch(track) is not None and len(track.encode()) <= MOST_NAME_BYTES
+    name = track if is_plain else f"flight-{sha256_bytes(track.encode())}"
+    return Journal(folder / f"{name}.jsonl")
+
+
 class AnswerBook:
     """The journals of one folder, a context manager. All methods run on one event loop."""
 
@@ -132,9 +139,7 @@ class AnswerBook:
 
     def _open(self, track: str) -> tuple[Journal, dict[str, Answer]]:
         if track not in self._tracks:
-            is_plain = _PLAIN_NAME.fullmatch(track) is not None and len(track.encode()) <= MOST_NAME_BYTES
-            name = track if is_plain else f"flight-{sha256_bytes(track.encode())}"
-            journal = Journal(self.folder / f"{name}.jsonl")
+            journal = journal_of(self.folder, track)
             self._tracks[track] = journal, {answer.key: answer for answer in journal.read_as(Answer.model_validate)}
             if journal.num_damaged:
                 log.warning("%s: %d damaged lines are skipped", journal.path, journal.num_damaged)

@@ -32,6 +32,14 @@ class StageSummary:
     state: Literal["complete", "begun", "to do"]
     tally: Tally | None = None  # outcomes of its items so far; None before it began
     seconds: float | None = None  # None before it is complete
+    num_items: int | None = None  # of a stage that has begun; None if it is not known
+
+    @property
+    def items(self) -> str:
+        """Its outcomes in words: `8 kept of 8 so far, of 10`."""
+        if self.tally is None or self.state == "complete":
+            return str(self.tally or "")
+        return f"{self.tally} so far" + (f", of {self.num_items}" if self.num_items else "")
 
     @property
     def size_bytes(self) -> int:
@@ -77,11 +85,21 @@ def summarize(run: Path) -> RunSummary:
     names = list(STAGES)
     if cfg.towns:  # one release is made of all towns
         names = [*(f"{town}/{name}" for town in cfg.towns for name in STAGES[:-1]), "release"]
-    stages = [_stage(name, run / name) for name in names]
+    towns = {"": cfg} | (cfg.all_towns() if cfg.towns else {})
+    stages = []
+    for name in names:
+        town, _, stage = name.rpartition("/")
+        stages.append(_stage(name, run / name, _num_items(towns[town], run / town).get(stage)))
     return RunSummary(cfg, stages)
 
 
-def _stage(name: str, folder: Path) -> StageSummary:
+def _num_items(cfg: RunConfig, out: Path) -> dict[str, int]:
+    """Return the number of items of the stages in which it is known before they end."""
+    num_paths, num_tracks = cfg.pedestrians.num_paths, len(num_frames(cfg, out)) * len(cfg.render.tracks)
+    return {"pedestrians": num_paths, "plan": num_paths, "render": num_tracks, "inspect": num_tracks}
+
+
+def _stage(name: str, folder: Path, num_items: int | None = None) -> StageSummary:
     if (folder / "manifest.json").exists():
         manifest = read_manifest(folder)
         return StageSummary(name, folder, "complete", manifest.counts, manifest.seconds)
@@ -91,7 +109,7 @@ def _stage(name: str, folder: Path) -> StageSummary:
     tally = Tally(input=len(outcomes))
     for record in outcomes.values():
         tally.count(record)
-    return StageSummary(name, folder, "begun", tally)
+    return StageSummary(name, folder, "begun", tally, None, num_items)
 
 
 # --- estimates --------------------------------------------------------------------------------------------------------
@@ -176,8 +194,11 @@ def _estimates(cfg: RunConfig, out: Path, frames: list[int]) -> Iterator[StageEs
         "frames": sum(frames) * num_tracks,
         "windows": sum(math.ceil(count / window.stride) for count in num_starts) * num_tracks,
     }
+    num_items = _num_items(cfg, out)
     for name in STAGES[:-1]:
-        yield _estimate(name, counts[RATES[name].unit], cfg, out)
+        begun = _stage(name, out / name, num_items.get(name))
+        share_done = begun.tally.input / begun.num_items if begun.tally and begun.num_items else 0.0
+        yield _estimate(name, round(counts[RATES[name].unit] * (1.0 - min(share_done, 1.0))), cfg, out)
 
 
 def _release(cfg: RunConfig, out: Path, town_frames: list[list[int]]) -> StageEstimate:

@@ -67,6 +67,7 @@ _SIZES = {
     "area": rf"{_NUMBER} ?(km2|km²|square kilomet(?:er|re)s?|sq\.? ?km|hectares?|ha|m2|m²|square met(?:er|re)s)(?!\w)",
     "length": rf"{_NUMBER} ?{_LENGTH} long\b",  # "800 m long"
 }
+_CARS = r"\b(\d+) ((?:[a-z-]+ )?cars|cars parked)\b"  # a number, which is not used: "20 parked cars"
 _ABSENT = r"\b(?:no|without(?: any)?)\s+((?:(?! (?:but|and|with) )[^.,;:()])+)"  # "without any towers"
 _STOPS = "|".join(_longest_first(STOPS))
 
@@ -177,11 +178,12 @@ class _Reader:
         matches = {name: self._take(pattern) for name, pattern in patterns.items()}
         return {name: match for name, match in matches.items() if match is not None}
 
-    def _take_words(self, words: str) -> None:
-        """Take all of some words, singular or plural."""
+    def _take_words(self, words: str, meaning: str = "") -> None:
+        """Take all of some words, singular or plural; meaning: what they were used for, if that is not plain."""
         for word in _longest_first(_words(words)):
-            while self._take(rf"(?<![\w-]){re.escape(word)}s?(?![\w-])"):
-                pass
+            while match := self._take(rf"(?<![\w-]){re.escape(word)}s?(?![\w-])"):
+                if meaning:
+                    self.used[-1] = f"{match[0].strip()} ({meaning})"
 
     def _take_counted(self, word: str, plural_count: int, *, needs_number: bool = False) -> int | None:
         """Take a noun, not its adjectives; return its number, or None if the text does not hold it.
@@ -208,6 +210,8 @@ class _Reader:
         limits = [name for name in self.heights if name != "at_least"]
         for name in limits[1:]:  # only the first limits the highest building
             self.not_used.append(self.heights.pop(name)[0].strip())
+        while match := self._take(_CARS, keep=r"\2 ,"):  # before the words of cars
+            self.not_used.append(f"{match[1]} (of cars)")
         while match := self._take(_ABSENT):  # before the nouns: "without towers" names no tower
             self.absent += f"{match[1]}, "
         self.objects = self._take_objects()  # before buildings: a clock tower is no tower
@@ -261,7 +265,7 @@ class _Reader:
                 raise InputError(what, where="PROMPT", got=got, fix="use only one of these words")
             for choice in word_of:
                 choices[group] = choice
-                self._take_words(rows[choice]["words"])
+                self._take_words(rows[choice]["words"], group)
         for group, choice in choices.items():
             for name, factor in WORDS["groups"][group][choice].items():
                 if name != "words":
@@ -348,9 +352,12 @@ class _Reader:
             raise InputError("the range of building heights is impossible", where="PROMPT", got=got, expected=expected)
         rows = [row for name, row in WORDS["buildings"].items() if name != "building"]
         kinds = "|".join(word for row in rows for word in _words(row["words"]))
-        before = rf"\b(?:{kinds})(?:e?s)?(?: (?:of|with|are))? ?$"
-        is_of_a_kind = any(re.search(before, match.string[: match.start()]) for match in self.heights.values())
-        self.plan["highest_m"] = None if is_of_a_kind else high_m  # "houses of up to 3 floors" limit no lighthouse
+        before = rf"\b(?:{kinds})(?:e?s)?(?: ?,)?(?: (?:of|with|are))? ?$"
+        is_of_a_kind = any(
+            re.search(before, match.string[: match.start()]) and not match[0].startswith(("no", "none"))
+            for match in self.heights.values()
+        )
+        self.plan["highest_m"] = None if is_of_a_kind else high_m  # "houses, at most 3 floors high" limit no lighthouse
         for group in (self.plan, *self.plan["buildings"]):
             group["heights_m"] = _limited(group["heights_m"], low_m, high_m, is_replaced="between" in self.heights)
 

@@ -106,15 +106,20 @@ def check_world(town: Town, plan: WorldPlan) -> list[WorldCheck]:
     return checks
 
 
-def _problems(checks: list[WorldCheck], town: Town, trace: dict[str, Any]) -> str:
-    """Return one line that names what of a prompt the world does not respect; empty where it respects all."""
+def _not_respected(checks: list[WorldCheck], trace: dict[str, Any]) -> list[str]:
+    """Return what of a plan the world does not respect."""
     unmet = [
         f"{check['check']} ({check['got']:g}, expected {check['least']:g} to {check['most']:g})"
         for check in checks if not check["is_met"]
     ]  # fmt: skip
+    return trace.get("not_respected", []) + unmet
+
+
+def _problems(not_respected: list[str], town: Town, trace: dict[str, Any]) -> str:
+    """Return one line that names what of a prompt the world does not respect; empty where it respects all."""
     missing = Counter(f"{name} ({reason})" for name, reason in town.not_placed)
     lists = {
-        "not respected": trace.get("not_respected", []) + unmet,
+        "not respected": not_respected,
         "not placed": [f"{count} x {name}" if count > 1 else name for name, count in missing.items()],
         "words not used": trace["not_used"],
     }
@@ -186,17 +191,19 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     town = build(plan, cfg.name, seed)
     _write_world(town, out)
     checks = check_world(town, plan)
-    unread = {"not_respected": trace.get("not_respected", []), "words_not_used": plan.not_used}
+    not_respected = _not_respected(checks, trace)
+    unread = {"not_respected": not_respected, "words_not_used": plan.not_used}
     write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks, **unread})
     write_bytes(out / "map.png", _picture(town, plan))
     _write_settings(cfg.name, product, out / LOOP_FILE)
     if "used" in trace:
         log.info("words used: %s", ", ".join(trace["used"]))
-    if problems := _problems(checks, town, trace):
+    if problems := _problems(not_respected, town, trace):
         log.warning("%s", problems)
     by_seed = "" if trace.get("pattern_is_named", True) else " (chosen by the seed)"
     water = f" and water {plan.river_m:g} m wide" if plan.river_m else ""
     counts = Counter([name for name, _ in _open_blocks(town, plan)] + [obj.name for obj in town.placed])
+    counts.update({kind.name: town.built[kind.name] for kind in plan.buildings})
     place = trace.get("settlement", "town")
     log.info("the %s has %s streets%s%s; placed: %s", place, plan.pattern, by_seed, water, counts_text(counts))
     num_kept = 1 + len(town.placed)
