@@ -186,7 +186,7 @@ def of(one):
 
 def test_a_flight_that_is_counted_by_hand():
     found = of(flight("1100001101", num_walk_frames=20, ended="left"))  # one loss of 4 frames, one blink
-    assert found["in_view"] == 5 / 20
+    assert found["visible"] == 5 / 20
     assert (found["tracked_frames"], found["lost"]) == (5, 1)
     assert (found["kept_s"], found["success"], found["left"], found["crashed"]) == (1.0, 0, 1, 0)
 
@@ -215,7 +215,7 @@ def test_a_score_adds_up_and_is_read_as_written(tmp_path):
     flights = [flight("11" * (k + 1), walk=f"path_{k}") for k in range(4)] + [flight("10000", walk="path_9")]
     score = score_episodes(flights)
     assert score.figures["success"].value == 4 / 5
-    assert score.figures["in_view"].value == (2 + 4 + 6 + 8 + 1) / (2 + 4 + 6 + 8 + 5)
+    assert score.figures["visible"].value == (2 + 4 + 6 + 8 + 1) / (2 + 4 + 6 + 8 + 5)
     assert score.figures["success"].low <= 4 / 5 <= score.figures["success"].high
     assert score.figures["success"].count == len(flights)
     assert set(score.figures) == set(MEASURES)

@@ -194,7 +194,6 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "Qwen/Qwen3.5-2B": lambda root, target: make_random_student(target),
     "models/Qwen3.5-2B": lambda root, target: make_random_student(target),
     "work/roi_polygon.json": _shown("maps.md", '{"points_world"'),
-    "work/seeing": lambda root, target: make_random_student(target),
     "models/roberta-large": lambda root, target: make_encoder(target),
     "models/bert-base-chinese": lambda root, target: make_encoder(target),
     "work/students-captions/captions.jsonl": copy_of("runs/five/caption/captions.jsonl"),

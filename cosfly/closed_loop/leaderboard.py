@@ -19,9 +19,9 @@ from cosfly.viz.page import page
 from cosfly.viz.tables import TextTable
 
 Role = Literal["student", "floor", "ceiling"]
-RANKED_BY = ("success", "in_view")
-SUMMARY = {"success": "success", "in_view": "target visible", "crashed": "crashed"}  # in the terminal
-HEADLINE = ("success", "in_view", "tracked_frames", "kept_s", "lost", "crashed")
+RANKED_BY = ("success", "visible")
+SUMMARY = {"success": "success", "visible": "target visible", "crashed": "crashed"}  # in the terminal
+HEADLINE = ("success", "visible", "tracked_frames", "kept_s", "lost", "crashed")
 BOARD_FORMAT = FileFormat("cosfly.leaderboard", "3.0", "leaderboard")
 
 

@@ -3,7 +3,7 @@
 Success is our definition: the drone followed to the end of the pedestrian trajectory, the target was visible within the
 last LOSS_S, and the drone ended within BAND_M of it. EVT-Bench (TrackVLA, its public code) requires the same at the
 episode's end, facing the target at 1 to 3 m, and ends an episode at a collision or after 20 steps beyond 4 m; DAT's
-success rate is the share of time with a visible target (our `in_view`). UAV-Track VLA reports 61.76 % success and
+success rate is the share of time with a visible target (our `visible`). UAV-Track VLA reports 61.76 % success and
 269.65 tracked frames on far pedestrians in CARLA without a definition that we could find: these are not comparable.
 """
 
@@ -26,8 +26,8 @@ RESAMPLES, CONFIDENCE = 2000, 0.95
 # Name -> description; each is the ratio of two sums over episodes (EpisodeScore.sums).
 MEASURES = {
     "success": "success",
-    "in_view": "target visible, share of all frames of the pedestrian trajectories",
-    "in_picture": "target in the picture, hidden or not",
+    "visible": "target visible, share of all frames of the pedestrian trajectories",
+    "in_view": "target in the picture, hidden or not",
     "tracked_frames": "frames with a visible target, per episode",
     "kept_s": "time to the first loss, crash or the end, s",
     "lost": f"episodes that lose the target for {LOSS_S:g} s",
@@ -37,7 +37,7 @@ MEASURES = {
     "left": "episodes that leave the map",
     "no_decision": "decisions that were missing or invalid",
 }
-SHARES = {"success", "in_view", "in_picture", "lost", "in_band", "crashed", "left", "no_decision"}
+SHARES = {"success", "visible", "in_view", "lost", "in_band", "crashed", "left", "no_decision"}
 
 
 def measure(record: Episode) -> EpisodeScore:
@@ -56,8 +56,8 @@ def measure(record: Episode) -> EpisodeScore:
     answers = Counter(frame.answer for frame in decisions)
     sums = {
         "success": (success, 1),
-        "in_view": (sum(frame.visible for frame in flown), record.num_walk_frames),
-        "in_picture": (sum(frame.in_view for frame in flown), record.num_walk_frames),
+        "visible": (sum(frame.visible for frame in flown), record.num_walk_frames),
+        "in_view": (sum(frame.in_view for frame in flown), record.num_walk_frames),
         "tracked_frames": (sum(frame.visible for frame in flown), 1),
         "kept_s": ((losses[0][0] if losses else num_frames) * dt_s, 1),
         "lost": (bool(losses), 1),

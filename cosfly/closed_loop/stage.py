@@ -273,7 +273,7 @@ def finish_episodes(
     stage.finish(outputs, tally, flown=dict(sorted(ended.items())) | {"decisions": decisions})
     log.info(
         "fly: %s: target in the picture in %.1f %%, visible in %.1f %% of the frames; %s; %d decisions%s; see %s",
-        fly.student, *(100 * (score.figures[name].value or 0.0) for name in ("in_picture", "in_view")),
+        fly.student, *(100 * (score.figures[name].value or 0.0) for name in ("in_view", "visible")),
         ", ".join(f"{count} {end}" for end, count in sorted(ended.items())), decisions,
         f" (episodes shortened by fly.most_decisions={fly.most_decisions})" if score.most_decisions else "",
         stage.path / SCORE,

@@ -245,6 +245,7 @@ def _take_steps(context: TrainingContext, optimizer: Any, progress: Progress, fo
                 log.info("%s: stopped after step %d, with a checkpoint", STAGE, done)
                 raise KeyboardInterrupt if signal.SIGINT in received else SystemExit(128 + signal.SIGTERM)
             if is_last:
+                log.info("%s: the last step, %d of %d, has loss %.4f", STAGE, done, num_steps, facts["loss"])
                 break
             step_start_s = time.monotonic()
     return progress

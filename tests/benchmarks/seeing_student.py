@@ -1,8 +1,18 @@
-"""A student that sees, of real parts: SmolLM2-135M as the language model of transformers' SmolVLM class, with a small
+r"""A student that sees, of real parts: SmolLM2-135M as the language model of transformers' SmolVLM class, with a small
 vision tower that is trained here to find the person in the frames of a run.
 
     python tests/benchmarks/seeing_student.py --language SmolLM2-135M-Instruct.Q4_1.gguf --without old_town market \
-        --out work/seeing runs/diverse/*/render
+        --epochs 14 --out work/seeing runs/diverse/*/render
+    cosfly distill prepare runs/diverse --out work/set-pictures --limit 17000 --set 'distill.prepare.languages=[en]' \
+        --set distill.prepare.text_state=false --set distill.prepare.split_by=town \
+        --set distill.prepare.test_fraction=0.2 --set distill.prepare.val_fraction=0
+    trees=$(printf -- '--data %s ' runs/diverse/*/render)
+    cosfly distill train --dataset work/set-pictures $trees --student work/seeing --out work/train-see \
+        --set distill.train.method=full --set distill.train.train_vision=true --set distill.train.learning_rate=3e-4 \
+        --set distill.train.max_steps=200 --set distill.train.samples_per_step=32 --set distill.train.batch_size=16 \
+        --set distill.train.keep=last --set distill.train.validation_samples=0
+    cosfly distill infer --dataset work/set-pictures $trees --out work/infer-see --model work/train-see/model \
+        --set distill.infer.max_samples=400 --set distill.infer.batch_size=256
 
 No package of the index has a vision tower for a vision-language model, and captions of a few towns do not teach one.
 The tower learns which patch shows the target, and how far away it is. The share of frames whose patch it finds is
