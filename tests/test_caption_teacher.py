@@ -43,7 +43,8 @@ def test_a_decision_against_its_own_reasoning_is_asked_for_again_with_what_was_w
         cfg = settings(server.url, limit=1, repair=KEEP, writing=writing)
         captions = list(read_captions(run(cfg, tree, tmp_path / "out")))
     assert [c.status for c in captions] == ["accepted"]
-    assert captions[0].checks.refused == ["decision_mismatch"]
+    (refused,) = captions[0].checks.refused
+    assert refused.startswith('decision_mismatch: "therefore" says')
     assert captions[0].therefore == captions[0].en.flight_decision == "ascend"
     asked, corrected, _ = (json.loads(body) for body in server.bodies)
     assert corrected["messages"][:2] == asked["messages"]

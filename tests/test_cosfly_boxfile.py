@@ -2,17 +2,18 @@
 
 import json
 import re
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from shapely.geometry import Polygon
+from shapely import LineString, Polygon, union_all
 
 from cosfly.formats.boxes import BoxMap, write_boxes
-from cosfly.formats.kinds import KIND_NAMES
+from cosfly.formats.kinds import KIND_NAMES, KINDS
 from cosfly.maps.boxfile import BoxesConfig, load
-from cosfly.maps.footprints import CUT_SHARES, num_cuts
+from cosfly.maps.footprints import CUT_SHARES, footprints, num_cuts
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
 from cosfly.runtime.errors import ConfigError, InputError
@@ -233,6 +234,27 @@ def test_openstreetmap_and_overture_need_the_name_of_the_type_column(tmp_path, c
     assert box_map.header.extent_sources == {"levels": 5, "file": 4, "default": 2}
     with pytest.raises(InputError, match="there is no type for class='x'"):
         loaded(tmp_path, collection(feature("Point", way[0], **{"class": "x"})), ".geojson", type_column="class")
+
+
+def test_water_is_open_below_bridges(tmp_path):
+    """A river as a line and as an outline, a skew street with and without a bridge over it."""
+    street = {"highway": "residential", "width": "8"}
+    line = feature("LineString", [[-90.0, 0.0], [90.0, 0.0]], waterway="river", width="20")
+    outline = feature("Polygon", [[[-90, -10], [90, -10], [90, 10], [-90, 10], [-90, -10]]], natural="water")
+    columns = {"type_column": "highway,natural,waterway", "units": "m"}
+    for river, bridge in product((line, outline), (None, "no", "yes")):
+        across = feature("LineString", [[-40.0, -50.0], [10.0, 50.0]], **street, bridge=bridge)
+        box_map = loaded(tmp_path, collection(river, across), ".geojson", **columns)
+        water = union_all(footprints(box_map)[box_map.kinds == KINDS["Water"]])
+        road = LineString([(-40.0, -50.0), (10.0, 50.0)]).buffer(4.0, cap_style="flat")
+        open_share = (
+            1.0 - water.intersection(road).area / Polygon(outline["geometry"]["coordinates"][0]).intersection(road).area
+        )
+        assert open_share > 0.9 if bridge == "yes" else open_share < 0.05
+        assert water.area > 0.85 * 180 * 20
+    wrong = feature("LineString", [[0.0, 0.0], [1.0, 0.0]], waterway="river", width="-3")
+    box_map = loaded(tmp_path, collection(outline, across, across, across, across, wrong), ".geojson", **columns)
+    assert box_map.header.dropped_objects == {"bad_value": 1}
 
 
 def test_what_an_outline_asks_for_is_bounded_before_it_is_made(tmp_path):

@@ -243,3 +243,29 @@ def test_the_width_of_a_street_sets_no_height():
     assert named[0].buildings == plain[0].buildings
     assert named[0].highest_m is None
     assert width in named[1]["not_used"]
+
+
+@pytest.mark.parametrize(
+    ("prompt", "highest_m", "houses_m"),
+    [
+        ("a town with houses, at most 12 m high, and a lighthouse", None, 12.0),
+        ("a town with houses of two or three storeys and a lighthouse", None, 9.6),
+        ("a town with a lighthouse, buildings at most 12 m high, except the lighthouse", None, 12.0),
+        ("a town with a lighthouse. No building except the lighthouse is higher than 12 m", None, 12.0),
+        ("a town with houses and a church, no building is higher than 12 m", 12.0, 12.0),
+    ],
+)
+def test_a_limit_of_height_is_for_what_it_names(prompt, highest_m, houses_m):
+    plan, trace = plan_by_rules(prompt, 0)
+    assert plan.highest_m == highest_m
+    assert max(kind.heights_m[1] for kind in plan.kinds_of_buildings()) <= houses_m + 1e-9
+    assert {obj["name"] for obj in plan.model_dump()["objects"]} <= {"lighthouse", "church"}
+    assert len(plan.objects) == 1
+    assert not trace["without"]
+
+
+def test_numbers_of_cars_are_not_used_and_words_say_what_they_change():
+    plan, trace = plan_by_rules("a town with narrow houses and about 20 parked cars", 0)
+    assert trace["not_used"] == ["20 (of cars)"]
+    assert {"narrow (streets)", "parked cars (cars)"} <= {*trace["used"]}
+    assert plan.parked_share > 0.25

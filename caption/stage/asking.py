@@ -331,6 +331,8 @@ class RunProgress:
             f"answers {answers['answers']:,} in {duration(elapsed_s)}" + self._waiting(),
             f"tokens {answers['prompt_tokens']:,} in {answers['completion_tokens']:,} out",
         ]
+        if answers["cut"]:
+            figures.append(f"{answers['cut']:,} answers cut at max_tokens")
         if prices.price_prompt or prices.price_completion:
             figures.append(f"cost {prices.cost(answers['prompt_tokens'], answers['completion_tokens']):.2f}")
         if num_asked := windows.input - self._num_recorded:

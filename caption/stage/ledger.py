@@ -31,7 +31,7 @@ REASONS = {
     "context_full": "prompt and answer fill the server's context: raise it, or send smaller pictures",
     "conflict": "the decision is in conflict with the trajectory (see `verdict`), and it is not asked again",
     "no_label": "the decision is in conflict, and geometry has no label to anchor a regeneration to",
-    "regeneration_failed": "no answer of caption.repair.max_asks asks had a decision without conflict",
+    "regeneration_failed": "the decision was in conflict, and no regenerated answer was accepted; see `checks.refused`",
     "decision_mismatch": "the reasoning leads to another action than the decision",
     "contradicted_value": "a number of the text contradicts the measured facts; see `checks.contradictions`",
     "invalid_slot": "a slot names no known fact of the window, or its braces, unit or side do not fit",

@@ -170,7 +170,7 @@ class WindowLoop:
             answer = self._draft(reply, question)
             if isinstance(answer, Draft) or not answer.complaint:
                 break
-            self._refused.append(answer.reason)
+            self._refused.append(f"{answer.reason}: {answer.complaint}"[:MOST_REFUSAL_TEXT])
             question = replace(question, correction=Correction(reply.text, answer.complaint, number))
         return answer
 
@@ -281,6 +281,10 @@ class WindowLoop:
                 return None
             if isinstance(answer, Refused) and answer.reason == CONTEXT_FULL:
                 return CONTEXT_FULL  # not a failure of the teacher
+            if isinstance(answer, Draft):
+                self._refused.append(f"conflict: the decision {answer.coc.flight_decision}")
+            elif not answer.complaint:
+                self._refused.append(f"structure: {answer.reason}")
         return "regeneration_failed"
 
     def _is_repaired(self, decision: str, rejected: str, anchor: str | None) -> bool:

@@ -147,6 +147,8 @@ class AnswerBook:
 
     def _count(self, answer: Answer) -> None:
         self.totals["answers"] += 1
+        if answer.finish_reason == "length":
+            self.totals["cut"] += 1
         self.totals.update(answer.usage)
 
     def __enter__(self) -> AnswerBook:

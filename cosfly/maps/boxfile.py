@@ -67,6 +67,8 @@ HSTORE_TAG = re.compile(r'"([^"\\]+)"=>"([^"\\]*)"')
 LINE_M = 0.1  # farthest that a corner of a line may be moved
 SLAB_M = 0.3  # thickness of a surface without a height: its top is the ground
 STOREY_M, LANE_M = 3.0, 3.5
+BRIDGE_EDGE_M = 0.5  # at each side: the default of pedestrians.safety_radius_m
+BRIDGE_NEAR_M = 15.0  # water so near to a bridge is covered apart: a long rectangle would reach into the opening
 # Width of a line, sides of a point, and height of a thing where `type_column` names the types and nothing is declared.
 DEFAULT_SIZES_M = {
     "Buildings": (10.0, 6.0), "Roads": (7.0, SLAB_M), "Sidewalks": (2.0, SLAB_M), "RailTrack": (3.0, SLAB_M),
@@ -227,6 +229,8 @@ def _read_rows(cfg: BoxesConfig, path: Path, *, is_table: bool) -> BoxMap:
     if not rows:
         raise InputError("the file has no boxes", where=path, expected="at least one row or feature with a box")
     rows = _in_metres(rows, units, path, is_table=is_table)
+    if not cfg.is_plain:
+        rows = _opened_below_bridges(rows, cfg)
     made = _make_boxes(rows, cfg)
     ids = _ids_of(rows) if cfg.is_plain else []
     _check_and_report(made, rows, ids, cfg, path)
@@ -238,6 +242,32 @@ def _read_rows(cfg: BoxesConfig, path: Path, *, is_table: bool) -> BoxMap:
     if ids and len(set(made.row_of_box)) == len(box_map):  # no row became several boxes
         box_map = replace(box_map, ids=np.array([ids[index] for index in made.row_of_box], dtype=np.uint64))
     return box_map
+
+
+def _opened_below_bridges(rows: list[_Row], cfg: BoxesConfig) -> list[_Row]:
+    """Return the rows with water cut out below ways with a `bridge` property, because nobody walks over water."""
+    areas: dict[int, Any] = {}  # of water and bridges, by row
+    waters, bridges = list[int](), list[int]()
+    for index, row in enumerate(rows):
+        try:
+            kind = _kind_of(row, cfg)
+            is_bridge = str(row.values.get("bridge") or "no") != "no" and KINDS[kind] in GROUND_KINDS
+            if row.problem or not (kind == "Water" or is_bridge):
+                continue
+            half_m = _size_of(row, kind, cfg).numbers.get("width_m", 0.0) / 2 if "Line" in row.shape.geom_type else 0.0
+        except _Skipped:  # counted later
+            continue
+        (bridges if is_bridge else waters).append(index)
+        areas[index] = row.shape.buffer(half_m + BRIDGE_EDGE_M * is_bridge, cap_style="flat")
+    bridge_area = shapely.union_all([areas[index] for index in bridges])
+    opened = list(rows)
+    near = bridge_area.buffer(BRIDGE_NEAR_M, cap_style="flat")
+    for index in waters:
+        if areas[index].intersects(bridge_area):
+            water = areas[index].difference(bridge_area)
+            parts = [*polygons_of(water.intersection(near)), *polygons_of(water.difference(near))]
+            opened[index] = rows[index]._replace(shape=shapely.multipolygons(parts))
+    return opened
 
 
 def _make_boxes(rows: list[_Row], cfg: BoxesConfig) -> _BoxesOfRows:

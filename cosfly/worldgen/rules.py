@@ -56,10 +56,11 @@ _HEIGHTS = {
                rf"|below|at most|up to|max(?:imum)?\.?(?: height)?(?: of)?|limited to) {_HEIGHT}",
     "or_less": rf"{_HEIGHT},? (?:at most|or less|or lower|maximum|at the most)",  # "20 m high or less"
     # "4 to 6 m", "between 10 m and 5 floors"
-    "between": rf"(?:\b(?:between|from) )?\b(?P<low>{_NUMBER}) ?(?:m|metres?|meters?)? ?(?:and|to|-) {_HEIGHT}",
+    "between": rf"(?:\b(?:between|from) )?\b(?P<low>{_NUMBER}) ?(?:m|metres?|meters?)? ?(?:and|to|or|-) {_HEIGHT}",
     "at_least": rf"(?:at least|more than|over|above|minimum) {_HEIGHT}",  # "over 40 m tall"
     "exactly": _HEIGHT,  # "3-storey"
 }  # fmt: skip
+_EXCEPT = r"(?:except(?: for)?|other than|apart from|but(?= (?:the|a)\b))"
 _SIZES = {
     "sides": rf"{_NUMBER} ?(?:{_LENGTH})? ?(?:x|×|by|times) ?{_NUMBER} ?{_LENGTH}",  # "600 x 400 m"
     "square": rf"{_NUMBER} ?{_LENGTH} (?:square\b|across|on (?:a|each) side)",  # "500 m across"
@@ -85,7 +86,11 @@ def _normalized(prompt: str) -> str:
     text = prompt.lower().replace("’", "'")
     for word in _longest_first(WORDS["numbers"]):
         text = re.sub(rf"\b{word}\b", str(WORDS["numbers"][word]), text)
-    for plain, pattern in (("1-stor", r"\bsingle[- ]stor"), ("hotel-buildings", r"(?<!\d )\bhotels\b")):
+    for plain, pattern in (
+        ("1-stor", r"\bsingle[- ]stor"), ("hotel-buildings", r"(?<!\d )\bhotels\b"),
+        # "no building except the church is higher than 12 m"
+        (r"except\2, \1 is", rf"\b((?:no|none|nothing)(?: \w+)?),? {_EXCEPT}((?: \w+){{1,4}}),? is\b"),
+    ):  # fmt: skip
         text = re.sub(pattern, plain, text)
     text = re.sub(r"\b([2-9]0)[- ]([1-9])\b", lambda match: str(int(match[1]) + int(match[2])), text)  # "20-5": 25
     for words in _longest_first(WORDS["amounts"]):
@@ -113,6 +118,7 @@ class _Reader:
         # What is read by `_take_phrases`.
         self.sizes: dict[str, re.Match[str]] = {}  # of the town, by name in _SIZES
         self.heights: dict[str, re.Match[str]] = {}  # of buildings, by name in _HEIGHTS
+        self.has_exception = False  # whether the limit of heights is not for all: "except the church"
         self.absent = ""  # what there is not, such as "towers, "
         self.objects: dict[str, int] = {}  # counts
         self.buildings: dict[str, int | None] = {}  # counts by kind; None for a plural without a number
@@ -207,6 +213,7 @@ class _Reader:
         while match := self._take(_WIDTH, keep=r"\1 ,"):  # before heights and the word "wide", which would misread it
             self.not_used.append(match[0].strip())
         self.heights = self._take_named(_HEIGHTS)
+        self.has_exception = bool(self.heights and self._take(rf"\b{_EXCEPT}\b"))
         limits = [name for name in self.heights if name != "at_least"]
         for name in limits[1:]:  # only the first limits the highest building
             self.not_used.append(self.heights.pop(name)[0].strip())
@@ -357,7 +364,8 @@ class _Reader:
             re.search(before, match.string[: match.start()]) and not match[0].startswith(("no", "none"))
             for match in self.heights.values()
         )
-        self.plan["highest_m"] = None if is_of_a_kind else high_m  # "houses, at most 3 floors high" limit no lighthouse
+        is_of_some = is_of_a_kind or self.has_exception
+        self.plan["highest_m"] = None if is_of_some else high_m  # "houses, at most 3 floors high" limit no lighthouse
         for group in (self.plan, *self.plan["buildings"]):
             group["heights_m"] = _limited(group["heights_m"], low_m, high_m, is_replaced="between" in self.heights)
 

@@ -165,10 +165,10 @@ def summary_tables(product: Path) -> Iterator[TextTable]:
 
 def notes_of(report: Evaluation) -> list[str]:
     """Return how the figures were measured."""
-    notes = [
-        f"Intervals: {report.confidence:.0%}, bootstrap over pedestrian trajectories, {report.resamples} draws.",
-        *NOTES,
-    ]
+    intervals = f"Intervals: {report.confidence:.0%}, bootstrap over pedestrian trajectories, {report.resamples} draws."
+    if all(part.walks < 2 for part in report.languages.values()):
+        intervals = "No intervals: they need the answers of two pedestrian trajectories."
+    notes = [intervals, *NOTES]
     for language, metric in report.metrics.items():
         text = "was not computed, because no encoder was passed."
         if metric is not None:
