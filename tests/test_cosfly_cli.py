@@ -11,6 +11,7 @@ from cosfly import cli
 from cosfly.cli.options import Job, resolve
 from cosfly.cli.run import print_run
 from cosfly.llm.protocol import base_url
+from cosfly.pipeline.runs import estimate
 from cosfly.pipeline.settings import RunConfig, explain, nested
 from cosfly.runtime.config import load
 from cosfly.runtime.errors import ConfigError, InputError
@@ -97,7 +98,11 @@ def test_the_items_of_a_stage_that_is_not_complete_are_so_far(capfd, tmp_path):
         for record in (Kept(id="a"), Kept(id="b"), Dropped(id="c", reason="short")):
             journal.append(record.model_dump())
     print_run(tmp_path)
-    assert "2 kept, 1 dropped (short 1) of 3 so far" in " ".join(capfd.readouterr().out.split())
+    shown = " ".join(capfd.readouterr().out.split())
+    assert "2 kept, 1 dropped (short 1) of 3 so far, " in shown
+    assert " of 40 " in shown
+    frames = {row.name: row.count for row in estimate(RunConfig(), tmp_path)}
+    assert frames["render"] == round(frames["inspect"] * 37 / 40)
 
 
 def test_every_form_of_an_address_leads_to_one_root():

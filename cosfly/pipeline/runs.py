@@ -85,21 +85,23 @@ def summarize(run: Path) -> RunSummary:
     names = list(STAGES)
     if cfg.towns:  # one release is made of all towns
         names = [*(f"{town}/{name}" for town in cfg.towns for name in STAGES[:-1]), "release"]
-    towns = {"": cfg} | (cfg.all_towns() if cfg.towns else {})
-    stages = []
-    for name in names:
-        town, _, stage = name.rpartition("/")
-        stages.append(_stage(name, run / name, _num_items(towns[town], run / town).get(stage)))
+    stages = [_stage(name, run / name) for name in names]
+    for index, stage in enumerate(stages):
+        if stage.state == "begun":
+            town, _, name = stage.name.rpartition("/")
+            town_cfg = cfg.all_towns()[town] if town else cfg
+            num_items = _num_items(town_cfg, len(num_frames(town_cfg, run / town))).get(name)
+            stages[index] = replace(stage, num_items=num_items)
     return RunSummary(cfg, stages)
 
 
-def _num_items(cfg: RunConfig, out: Path) -> dict[str, int]:
+def _num_items(cfg: RunConfig, num_trajectories: int) -> dict[str, int]:
     """Return the number of items of the stages in which it is known before they end."""
-    num_paths, num_tracks = cfg.pedestrians.num_paths, len(num_frames(cfg, out)) * len(cfg.render.tracks)
+    num_paths, num_tracks = cfg.pedestrians.num_paths, num_trajectories * len(cfg.render.tracks)
     return {"pedestrians": num_paths, "plan": num_paths, "render": num_tracks, "inspect": num_tracks}
 
 
-def _stage(name: str, folder: Path, num_items: int | None = None) -> StageSummary:
+def _stage(name: str, folder: Path) -> StageSummary:
     if (folder / "manifest.json").exists():
         manifest = read_manifest(folder)
         return StageSummary(name, folder, "complete", manifest.counts, manifest.seconds)
@@ -109,7 +111,7 @@ def _stage(name: str, folder: Path, num_items: int | None = None) -> StageSummar
     tally = Tally(input=len(outcomes))
     for record in outcomes.values():
         tally.count(record)
-    return StageSummary(name, folder, "begun", tally, None, num_items)
+    return StageSummary(name, folder, "begun", tally)
 
 
 # --- estimates --------------------------------------------------------------------------------------------------------
@@ -194,10 +196,11 @@ def _estimates(cfg: RunConfig, out: Path, frames: list[int]) -> Iterator[StageEs
         "frames": sum(frames) * num_tracks,
         "windows": sum(math.ceil(count / window.stride) for count in num_starts) * num_tracks,
     }
-    num_items = _num_items(cfg, out)
+    num_items = _num_items(cfg, len(frames))
     for name in STAGES[:-1]:
-        begun = _stage(name, out / name, num_items.get(name))
-        share_done = begun.tally.input / begun.num_items if begun.tally and begun.num_items else 0.0
+        stage = _stage(name, out / name)
+        num_done = stage.tally.input if stage.tally and stage.state == "begun" else 0
+        share_done = num_done / num_items.get(name, math.inf)
         yield _estimate(name, round(counts[RATES[name].unit] * (1.0 - min(share_done, 1.0))), cfg, out)
 
 
