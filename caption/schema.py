@@ -155,12 +155,7 @@ class RepairConfig(Config):
         description="anchored: the new prompt gives the label; hint: it names the rejected decision; multi_sample: the "
         "same prompt again; cascade: hint, multi_sample and anchored, until a decision is the label",
     )
-    max_asks: int = Field(
-        3,
-        ge=0,
-        le=10,
-        description="most regenerations of an answer in conflict, without corrections of each; 0: drop it",
-    )
+    max_asks: int = Field(3, ge=0, le=10, description="most regenerations of an answer in conflict; 0: drop it at once")
 
     def treatment_of(self, verdict: Verdict | None) -> Treatment:
         """Return the treatment of an answer with this verdict."""

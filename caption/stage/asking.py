@@ -336,9 +336,7 @@ class RunProgress:
         if prices.price_prompt or prices.price_completion:
             figures.append(f"cost {prices.cost(answers['prompt_tokens'], answers['completion_tokens']):.2f}")
         if num_asked := windows.input - self._num_recorded:
-            is_slow = num_asked < elapsed_s
-            figures.append(
-                f"{elapsed_s / num_asked:.0f} s per window" if is_slow else f"{num_asked / elapsed_s:.1f} windows/s"
-            )
+            rate = num_asked / elapsed_s
+            figures.append(f"{1 / rate:.0f} s per window" if rate < 1.0 else f"{rate:.1f} windows/s")
             figures.append(f"{duration(self.num_left * elapsed_s / num_asked)} left")
         return ", ".join(figures)

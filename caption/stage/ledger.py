@@ -196,14 +196,8 @@ def page_html(
     report: CaptionReport, cards: Sequence[Caption], folders: Mapping[str, Path], answers: Path, budget: BudgetConfig,
     name: str,
 ) -> str:  # fmt: skip
-    """Return the page of a run.
-
-    Args:
-        cards: Captions to show.
-        folders: Of the tracks by id, for pictures.
-        answers: The folder of the journals.
-        name: Of the run.
-    """
+    """Return the page of a run with this name. cards: Captions to show. folders: Of the tracks by id, for pictures.
+    answers: Folder of the journals."""
     return page(
         "caption/stage/report.html", title=name, style=STYLE, report=report, meanings=VERDICTS,
         values=tuple(ValueCounts.model_fields), language_names=LANGUAGE_NAMES, most_common=most_common,
