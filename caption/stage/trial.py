@@ -44,7 +44,10 @@ class _LoggedAnswers(KeptAnswers):
 
     async def ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:
         number, (kind, ask, *correction) = len(self.exchanges[sample_id]) + 1, purpose.split("/")
-        words = KINDS.get(kind, kind) + ("" if ask == "0" else f", ask {int(ask) + 1} with another seed")
+        hint = "a hint" if kind.startswith("hint_") else f"the label {kind}"
+        words = KINDS.get(kind, f"regeneration with {hint}") + (
+            "" if ask == "0" else f", ask {int(ask) + 1} with another seed"
+        )
         if correction:
             words += ", again: " + for_terminal(request.messages[-1]["content"][-1]["text"], MOST_LOGGED)
         log.info("%s: request %d, %s", sample_id, number, words)

@@ -52,6 +52,7 @@ log = logging.getLogger(__name__)
 STAGE = "pedestrians"
 REPORT_FORMAT = FileFormat("cosfly.pedestrians_report", "1.0")
 RETRY_REASONS = ("no_goal", "detour")
+MUCH_ON_ROAD = 0.2  # share of points on carriageways that is worth a line although it cannot be avoided
 UNUSED_SHARE = 0.01  # of the walkable ground; less is not worth a line of the log
 
 # The overview picture: RGB of cells and of the outline of the region of interest.
@@ -252,6 +253,8 @@ def run(
         if share and cfg.road_cost == 1 and box_map.is_any_of({KINDS["Sidewalks"]}).any():
             words = "%.1f %% of the points are on carriageways, away from crossings; "
             log.info(words + "set pedestrians.road_cost=20 to keep people on pavements", 100 * share)
+        elif share > MUCH_ON_ROAD:
+            log.info("%.0f %% of the points are on carriageways: the map has few pavements or paths there", 100 * share)
         write_bytes(out / "paths.png", draw_overview(ground, paths))
     rounded = {step: round(value, 4) for step, value in seconds.items()}
     stage.finish(outputs, outcomes.tally, ground=ground.counts, total=summary["total"], seconds_by_step=rounded)

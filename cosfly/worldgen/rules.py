@@ -68,7 +68,7 @@ _SIZES = {
     "area": rf"{_NUMBER} ?(km2|km²|square kilomet(?:er|re)s?|sq\.? ?km|hectares?|ha|m2|m²|square met(?:er|re)s)(?!\w)",
     "length": rf"{_NUMBER} ?{_LENGTH} long\b",  # "800 m long"
 }
-_CARS = r"\b(\d+) ((?:[a-z-]+ )?cars|cars parked)\b"  # a number, which is not used: "20 parked cars"
+_CARS = r"\b\d+ (?:[a-z-]+ )?cars(?: parked)?\b"  # a number, which is not used: "20 parked cars"
 _ABSENT = r"\b(?:no|without(?: any)?)\s+((?:(?! (?:but|and|with) )[^.,;:()])+)"  # "without any towers"
 _STOPS = "|".join(_longest_first(STOPS))
 
@@ -88,6 +88,7 @@ def _normalized(prompt: str) -> str:
         text = re.sub(rf"\b{word}\b", str(WORDS["numbers"][word]), text)
     for plain, pattern in (
         ("1-stor", r"\bsingle[- ]stor"), ("hotel-buildings", r"(?<!\d )\bhotels\b"),
+        (r"\1s of at most", r"\bthe (?:tallest|highest) (house|building)s? (?:is|are|has)\b"),
         # "no building except the church is higher than 12 m"
         (r"except\2, \1 is", rf"\b((?:no|none|nothing)(?: \w+)?),? {_EXCEPT}((?: \w+){{1,4}}),? is\b"),
     ):  # fmt: skip
@@ -217,8 +218,8 @@ class _Reader:
         limits = [name for name in self.heights if name != "at_least"]
         for name in limits[1:]:  # only the first limits the highest building
             self.not_used.append(self.heights.pop(name)[0].strip())
-        while match := self._take(_CARS, keep=r"\2 ,"):  # before the words of cars
-            self.not_used.append(f"{match[1]} (of cars)")
+        while match := self._take(_CARS):  # before the words of cars: "5 parked cars" are not many
+            self.not_used.append(match[0].strip())
         while match := self._take(_ABSENT):  # before the nouns: "without towers" names no tower
             self.absent += f"{match[1]}, "
         self.objects = self._take_objects()  # before buildings: a clock tower is no tower

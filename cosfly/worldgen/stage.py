@@ -36,6 +36,7 @@ CHECKS_FORMAT = FileFormat("cosfly.world_checks", "1.0", "checks of a world")
 CREDITS = "cosfly; sizes of assets by SimWorld, maitrix-org and contributors"
 MOST_CHARACTERS = 2000  # of a prompt
 PICTURE_PX = 1000  # longer side of the picture
+CARS = ("Car", "Truck")
 ROAD_COST = 20  # a metre of carriageway away from crossings costs as much as 20 m of pavement
 
 TASK = """You plan a town for a generator that lays out streets, blocks and buildings. The user describes the town.
@@ -106,12 +107,14 @@ def check_world(town: Town, plan: WorldPlan) -> list[WorldCheck]:
     return checks
 
 
-def _not_respected(checks: list[WorldCheck], trace: dict[str, Any]) -> list[str]:
+def _not_respected(checks: list[WorldCheck], town: Town, trace: dict[str, Any]) -> list[str]:
     """Return what of a plan the world does not respect."""
     unmet = [
         f"{check['check']} ({check['got']:g}, expected {check['least']:g} to {check['most']:g})"
         for check in checks if not check["is_met"]
     ]  # fmt: skip
+    if trace.get("cars") == "many" and not of_kinds(town.layout, *CARS).any():
+        unmet.append("parked cars (the streets are too narrow)")
     return trace.get("not_respected", []) + unmet
 
 
@@ -191,7 +194,7 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     town = build(plan, cfg.name, seed)
     _write_world(town, out)
     checks = check_world(town, plan)
-    not_respected = _not_respected(checks, trace)
+    not_respected = _not_respected(checks, town, trace)
     unread = {"not_respected": not_respected, "words_not_used": plan.not_used}
     write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks, **unread})
     write_bytes(out / "map.png", _picture(town, plan))
@@ -204,6 +207,7 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     water = f" and water {plan.river_m:g} m wide" if plan.river_m else ""
     counts = Counter([name for name, _ in _open_blocks(town, plan)] + [obj.name for obj in town.placed])
     counts.update({kind.name: town.built[kind.name] for kind in plan.buildings})
+    counts["parked car"] = int(of_kinds(town.layout, *CARS).sum())
     place = trace.get("settlement", "town")
     log.info("the %s has %s streets%s%s; placed: %s", place, plan.pattern, by_seed, water, counts_text(counts))
     num_kept = 1 + len(town.placed)
