@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from shapely import LineString, Polygon, union_all
+from shapely import LineString, MultiLineString, Polygon, affinity, union_all
 
 from cosfly.formats.boxes import BoxMap, write_boxes
 from cosfly.formats.kinds import KIND_NAMES, KINDS
@@ -215,7 +215,8 @@ def test_openstreetmap_and_overture_need_the_name_of_the_type_column(tmp_path, c
         feature("Point", [4.3002, 52.0001], amenity="bench"),
         feature("MultiPolygon", [square(4.302, 52.0, 1e-4)], building="church", **{"building:levels": "2"}),
     ]
-    osm = loaded(tmp_path, collection(*town), ".geojson", type_column="building,highway,natural")
+    osm = loaded(tmp_path, collection(*town), ".geojson", type_column="building,highway,natural",
+                 derive_pavements=False)  # fmt: skip
     assert osm.counts() == {"Buildings": 10, "Roads": 2, "Sidewalks": 2, "Vegetation": 1}
     assert_allclose(np.unique(2 * osm.half_extents[osm.kinds == 1][:, 1]), 7.0)
     assert (osm.header.num_objects, osm.header.dropped_objects) == (14, {"unmapped_type": 1})
@@ -230,10 +231,56 @@ def test_openstreetmap_and_overture_need_the_name_of_the_type_column(tmp_path, c
                 for k, one in enumerate(houses(*at, DEGREES))]  # fmt: skip
     overture.append(feature("LineString", way, subtype="road", **{"class": "residential"}))
     box_map = loaded(tmp_path, collection(*overture), ".geojson", type_column="class")
-    assert box_map.counts() == {"Buildings": 9, "Roads": 2}
-    assert box_map.header.extent_sources == {"levels": 5, "file": 4, "default": 2}
+    assert box_map.counts() == {"Buildings": 9, "Roads": 2, "Sidewalks": 4}
+    assert box_map.header.extent_sources == {"levels": 5, "file": 4, "default": 6}
     with pytest.raises(InputError, match="there is no type for class='x'"):
         loaded(tmp_path, collection(feature("Point", way[0], **{"class": "x"})), ".geojson", type_column="class")
+
+
+@pytest.mark.parametrize(("tags", "sides"), [
+    ({}, (1, 1)), ({"sidewalk": "both"}, (1, 1)), ({"sidewalk": "no"}, (0, 0)), ({"sidewalk": "separate"}, (0, 0)),
+    ({"sidewalk": "left"}, (1, 0)), ({"sidewalk": "right"}, (0, 1)), ({"sidewalk:left": "no"}, (0, 1)),
+    ({"sidewalk:both": "no"}, (0, 0)), ({"sidewalk:both": "no", "sidewalk:right": "yes"}, (0, 1)),
+    ({"highway": "service"}, (0, 0)), ({"highway": "motorway"}, (0, 0)),
+])  # fmt: skip
+def test_streets_get_the_pavements_that_their_tags_allow(tmp_path, tags, sides):
+    """A street of 6 m to the north-east, with the left pavement in the north-west."""
+    street = feature("LineString", [[0, 0], [70, 70]], **{"highway": "residential", "width": "6"} | tags)
+    box_map = loaded(tmp_path, collection(street), ".geojson", type_column="highway", units="m")
+    header = box_map.header
+    assert header.num_objects == 1
+    assert header.added_boxes == header.derived_ground == sum(sides)
+    assert ("Pavements are derived by cosfly" in header.credits) == any(sides)
+    pavements = box_map.select(box_map.kinds == KINDS["Sidewalks"])
+    offsets_m = (pavements.centers[:, 1] - pavements.centers[:, 0]) / np.sqrt(2)
+    assert_allclose(sorted(offsets_m), [4.0 * side for side in (-1, 1) if sides[side < 0]], atol=1e-3)
+    assert_allclose(2 * pavements.half_extents[:, 1], 2.0)
+
+
+def test_pavements_leave_carriageways_and_mapped_pavements_free(tmp_path):
+    """A crossing of a bent street of two ways and a side street, and a mapped footway along a part of it."""
+    turned = affinity.rotate(
+        MultiLineString([[[0, 0], [60, 0]], [[60, 0], [110, 20]], [[60, 0], [60, -50]]]), 17, (0, 0)
+    )
+    ways = [feature("LineString", np.asarray(line.coords).tolist(), highway="residential") for line in turned.geoms]
+    path = affinity.rotate(LineString([[10, 4.5], [30, 4.5]]), 17, (0, 0))
+    ways.append(feature("LineString", np.asarray(path.coords).tolist(), highway="footway"))
+    mapped, both = (
+        loaded(tmp_path, collection(*ways), ".geojson", type_column="highway", units="m", derive_pavements=derive)
+        for derive in (False, True)
+    )
+    roads, footway = (
+        union_all(footprints(mapped.select(mapped.kinds == KINDS[kind]))) for kind in ("Roads", "Sidewalks")
+    )
+    derived = union_all(footprints(both)[len(mapped) :])
+    assert derived.intersection(roads).area < 0.02 * derived.area
+    assert derived.intersection(footway).area < 2.1  # half a metre of the 2 m at each end
+    # Along every street of 7 m, but for the crossing and the mapped footway, both sides are paved without a gap.
+    for line in turned.geoms:
+        for side in (-4.5, 4.5):
+            edge = line.offset_curve(side)
+            free = edge.difference(roads.buffer(0.6)).difference(footway.buffer(0.6))
+            assert free.difference(derived).length < 0.01 * edge.length
 
 
 def test_water_is_open_below_bridges(tmp_path):

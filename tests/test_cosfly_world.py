@@ -16,7 +16,7 @@ from cosfly.maps.footprints import footprints, rectangle_polygon
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.json_io import read_json, read_model
+from cosfly.runtime.json_io import read_json, read_model, write_model
 from cosfly.runtime.run_dir import read_manifest
 from cosfly.worldgen.plan import OBJECTS, PLAN_FORMAT, WorldPlan
 from cosfly.worldgen.rules import plan_by_rules
@@ -256,6 +256,8 @@ def test_the_width_of_a_street_sets_no_height():
         ("a town with a lighthouse. No building except the lighthouse is higher than 12 m", None, 12.0),
         ("a town with houses and a church, no building is higher than 12 m", 12.0, 12.0),
         ("a town with a church; the tallest house is 12 m", None, 12.0),
+        ("a town with buildings at most 12 m high, but the church is higher", None, 12.0),
+        ("a town with a church, buildings at most 12 m high, but the square is paved", 12.0, 12.0),
     ],
 )
 def test_a_limit_of_height_is_for_what_it_names(prompt, highest_m, houses_m):
@@ -265,6 +267,37 @@ def test_a_limit_of_height_is_for_what_it_names(prompt, highest_m, houses_m):
     assert {obj["name"] for obj in plan.model_dump()["objects"]} <= {"lighthouse", "church"}
     assert len(plan.objects) == 1
     assert not trace["without"]
+
+
+def test_positions_and_forms_are_not_used():
+    """Positions are reported; flats are apartments, flat roofs are not; the water of a harbour is a river."""
+    prompt = "a village with a church in the middle, surrounded by houses with flat roofs, a harbour and no river"
+    plan, trace = plan_by_rules(prompt, 0)
+    assert trace["not_used"] == ["flat", "middle (position)", "surrounded (position)"]
+    assert [kind.name for kind in plan.buildings] == ["house"]
+    assert plan.river_m
+    assert trace["not_respected"] == ["no river: other water, such as a harbour, is built as a river"]
+    for words in ("flats", "blocks of flats", "4 blocks of flats"):
+        (kind,) = plan_by_rules(f"a town with {words}", 0)[0].buildings
+        assert (kind.name, kind.count) == ("apartment block", 4 if "4" in words else None)
+
+
+def test_an_edited_plan_gives_the_same_town_with_the_change(tmp_path):
+    first = run(WorldConfig(prompt="a small village with terraced houses"), tmp_path / "first").parent
+    plan = read_model(first / "plan.json", WorldPlan, PLAN_FORMAT)
+    town = build(plan, "T", 0)
+    houses = footprints(town.layout.select(of_kinds(town.layout, "Buildings")))
+    distances_m = [shapely.distance(house, np.delete(houses, index)).min() for index, house in enumerate(houses)]
+    assert np.median(distances_m) < 0.1  # in rows
+    (tmp_path / "copy.json").write_bytes((first / "plan.json").read_bytes())
+    same = run(WorldConfig(plan=tmp_path / "copy.json"), tmp_path / "same")
+    assert same.read_bytes() == (first / same.name).read_bytes()
+    write_model(tmp_path / "copy.json", plan.model_copy(update={"river_m": 20.0}), PLAN_FORMAT)
+    obeyed("world", str(tmp_path / "copy.json"), "--out", str(tmp_path / "river"))
+    assert read_json(tmp_path / "river/plan.json", what="plan")["river_m"] == 20.0
+    (tmp_path / "copy.json").write_text('{"schema": "cosfly.world_plan", "schema_version": "2", "pattern": "square"}')
+    with pytest.raises(InputError, match="pattern: Input should be"):
+        run(WorldConfig(plan=tmp_path / "copy.json"), tmp_path / "wrong")
 
 
 def test_numbers_of_cars_are_not_used_and_words_say_what_they_change():

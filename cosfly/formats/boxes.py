@@ -80,7 +80,7 @@ class MapHeader(_Kept):
     extent_sources: dict[str, int] = {}  # number of boxes by the source of their size
     roads: dict[str, float] = {}
     added_boxes: int = 0  # number of boxes that the source does not hold
-    derived_ground: int = 0  # number of these that are ground, derived from the buildings
+    derived_ground: int = 0  # number of these that are ground, derived from buildings or streets
     offset_m: dict[str, float] = {}  # added to coordinates of this map, gives those of the source
     num_objects: int | None = None  # of the source, including dropped ones
     dropped_objects: dict[str, int] = {}

@@ -11,7 +11,7 @@ import io
 import logging
 import math
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -35,6 +35,7 @@ from cosfly.maps.footprints import (
     Rectangle,
     check_outline,
     cover,
+    credits_with,
     num_cuts,
     oriented_rectangle,
     polygons_of,
@@ -61,10 +62,12 @@ OTHERS = ("z_m", "yaw_deg", "building:levels", "building:min_level", "lanes")
 PLACE = ("x_m", "y_m", "length_m", "width_m")  # every table has them; and height_m, except of surfaces
 TYPES = [kind for kind in KINDS if kind != "NONE"]
 GEOMETRIES = ("Point", "LineString", "Polygon", "MultiPoint", "MultiLineString", "MultiPolygon")  # of GeoJSON
+WITHOUT_PAVEMENT = ("no", "none", "separate")  # values of `sidewalk`; separate: mapped as a way of its own
 LARGEST_PLACE = 1e8  # absolute value of a coordinate of GeoJSON, in any unit
 MOST_NAME = 40  # characters of a name in messages
 HSTORE_TAG = re.compile(r'"([^"\\]+)"=>"([^"\\]*)"')
 LINE_M = 0.1  # farthest that a corner of a line may be moved
+PAVEMENT_CREDITS = "Pavements are derived by cosfly from the streets, not mapped."
 SLAB_M = 0.3  # thickness of a surface without a height: its top is the ground
 STOREY_M, LANE_M = 3.0, 3.5
 BRIDGE_EDGE_M = 0.5  # at each side: the default of pedestrians.safety_radius_m
@@ -96,11 +99,13 @@ class TypeRule(NamedTuple):
 
 
 # A line of the file stands for several columns and values, separated by `|`.
+FEATURES = read_yaml(Path(__file__).with_name("feature_rules.yaml"))
 TYPE_RULES = [
     TypeRule(column, value, line.get("geometry", ""), kind)
-    for line in read_yaml(Path(__file__).with_name("feature_rules.yaml"))["rules"]
+    for line in FEATURES["rules"]
     for column in line["column"].split("|") for values, kind in line["kinds"].items() for value in values.split("|")
 ]  # fmt: skip
+STREETS_WITH_PAVEMENTS = FEATURES["streets_with_pavements"].split("|")
 
 
 class BoxesConfig(Config):
@@ -128,6 +133,9 @@ class BoxesConfig(Config):
     ignore: list[str] = Field([], description="columns or properties to ignore; ['*']: all unknown ones")
     ground_z_m: float = Field(0.0, description="height of the flat ground, in the file's coordinates, m")
     derive_ground: bool = Field(False, description="derive streets, pavements and lawn from the buildings")
+    derive_pavements: bool = Field(
+        True, description="add pavements of 2 m along streets of OpenStreetMap and Overture that have none"
+    )
     licence: MapLicence = UNKNOWN_LICENCE
     credits: str = Field("", description="attribution of the map's makers, in one or more sentences")
 
@@ -215,6 +223,8 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
         log.info("%s: the middle of the map, %s, becomes the origin", path.name, origin[:2].tolist())
         changes["offset_m"] = dict(zip("xyz", origin.tolist(), strict=True))
         box_map = replace(box_map, centers=box_map.centers - origin)
+    if box_map.header.derived_ground:
+        changes["credits"] = credits_with(PAVEMENT_CREDITS, cfg.credits)
     box_map = replace(box_map, header=box_map.header.model_copy(update=changes))
     return with_derived_ground(box_map) if cfg.derive_ground else box_map
 
@@ -229,19 +239,71 @@ def _read_rows(cfg: BoxesConfig, path: Path, *, is_table: bool) -> BoxMap:
     if not rows:
         raise InputError("the file has no boxes", where=path, expected="at least one row or feature with a box")
     rows = _in_metres(rows, units, path, is_table=is_table)
+    num_objects = len(rows)
     if not cfg.is_plain:
+        if cfg.derive_pavements:
+            rows = [*rows, *_pavements_of(rows, cfg)]
         rows = _opened_below_bridges(rows, cfg)
     made = _make_boxes(rows, cfg)
     ids = _ids_of(rows) if cfg.is_plain else []
     _check_and_report(made, rows, ids, cfg, path)
-    header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows))
+    header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=num_objects)
     changes: dict[str, Any] = {"dropped_objects": dict(made.dropped.counts)} if made.dropped.counts else {}
+    if num_derived := sum(index >= num_objects for index in made.row_of_box):
+        log.info(
+            "%s: %d boxes of pavement are added along streets (maps.boxes.derive_pavements)", path.name, num_derived
+        )
+        changes |= {"added_boxes": num_derived, "derived_ground": num_derived}
     if set(made.size_sources) != {"file"}:
         changes["extent_sources"] = dict(made.size_sources)
     box_map = made.boxes.box_map(header.model_copy(update=changes))
     if ids and len(set(made.row_of_box)) == len(box_map):  # no row became several boxes
         box_map = replace(box_map, ids=np.array([ids[index] for index in made.row_of_box], dtype=np.uint64))
     return box_map
+
+
+def _pavements_of(rows: list[_Row], cfg: BoxesConfig) -> list[_Row]:
+    """Return rows of pavements along the streets that have none according to their `sidewalk` properties.
+
+    Nothing is added on carriageways and mapped pavements.
+    """
+    paved: list[Any] = []  # areas of the mapped carriageways and pavements
+    streets = defaultdict[tuple[float, float, str], list[Any]](list)  # by width, side (1: left), and value of `bridge`
+    for row in rows:
+        try:
+            kind = _kind_of(row, cfg)
+            if row.problem or kind not in ("Roads", "Sidewalks"):
+                continue
+            width_m = _size_of(row, kind, cfg).numbers.get("width_m", 0.0)
+        except _Skipped:  # counted later
+            continue
+        is_line = "Line" in row.shape.geom_type
+        paved.append(row.shape.buffer(width_m / 2, cap_style="flat") if is_line else row.shape)
+        if is_line and kind == "Roads" and _type_of(row, cfg)[1] in STREETS_WITH_PAVEMENTS:
+            for side in _pavement_sides(row.values):
+                streets[width_m, side, str(row.values.get("bridge") or "no")] += shapely.get_parts(row.shape).tolist()
+    width_m, _ = DEFAULT_SIZES_M["Sidewalks"]
+    paved_area = shapely.union_all(paved).buffer(width_m / 4, join_style="mitre")  # as much as boxes of a line overlap
+    pavements: list[_Row] = []
+    for (street_m, side, bridge), lines in streets.items():
+        merged = shapely.get_parts(shapely.line_merge(shapely.multilinestrings(lines), directed=True))
+        edges = shapely.offset_curve(merged, side * (street_m + width_m) / 2, join_style="mitre")
+        free = [line for edge in edges for line in shapely.get_parts(edge.difference(paved_area))]
+        if free:
+            values = {cfg.type_columns[0]: "Sidewalks", "bridge": bridge}
+            pavements.append(_Row("a derived pavement", values, shapely.multilinestrings(free)))
+    return pavements
+
+
+def _pavement_sides(values: Mapping[str, Any]) -> list[float]:
+    """Return the sides of a street that may have a pavement: 1 for the left one, -1 for the right one."""
+    both = values.get("sidewalk") or values.get("sidewalk:both") or "both"
+    sides = {"left": 1.0, "right": -1.0}
+    if both in sides:
+        return [sides[both]]
+    default = "no" if both in WITHOUT_PAVEMENT else "yes"
+    found = {name: values.get(f"sidewalk:{name}") or default for name in sides}
+    return [sides[name] for name in sides if found[name] not in WITHOUT_PAVEMENT]
 
 
 def _opened_below_bridges(rows: list[_Row], cfg: BoxesConfig) -> list[_Row]:
@@ -519,13 +581,17 @@ def _add_row(boxes: BoxList, row: _Row, cfg: BoxesConfig, repairs: list[str]) ->
     return size.source
 
 
+def _type_of(row: _Row, cfg: BoxesConfig) -> tuple[str, str]:
+    """Return the column of a row's type and its value, the first that is not empty."""
+    for column in cfg.type_columns:
+        if row.values.get(column):
+            return column, str(row.values[column])
+    return cfg.type_columns[0], ""
+
+
 def _kind_of(row: _Row, cfg: BoxesConfig) -> str:
     """Return the kind of a row; raise _Skipped if its type is unknown."""
-    column, name = cfg.type_columns[0], ""
-    for type_column in cfg.type_columns:  # the first with a value
-        if row.values.get(type_column):
-            column, name = type_column, str(row.values[type_column])
-            break
+    column, name = _type_of(row, cfg)
     kind = cfg.types.get(name, name)
     if kind in TYPES:
         return kind

@@ -4,6 +4,7 @@ With them `with_derived_ground` lays ground into a map of buildings without stre
 (`derived_ground`), and its credits, that every release repeats, say so.
 """
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -19,6 +20,8 @@ from cosfly.geometry.axes import box_corners
 from cosfly.geometry.grid import blocks_walking
 from cosfly.maps.boxlist import BoxList
 from cosfly.runtime.io import over_limit
+
+log = logging.getLogger(__name__)
 
 MIN_AREA_M2 = 0.02  # smaller pieces are rounding errors of a cut
 THINNEST_M = 1e-3  # thinner rectangles are rounding errors too
@@ -199,10 +202,17 @@ def united(polygons: list[Polygon]) -> BaseGeometry:
 # --- derived ground: pavement along facades, asphalt between near buildings, lawn elsewhere ---------------------------
 
 
+def credits_with(sentence: str, credits: str) -> str:
+    """Return credits with a sentence about what cosfly added."""
+    return f"{credits.rstrip('. ')}. {sentence}".removeprefix(". ")
+
+
 def with_derived_ground(box_map: BoxMap) -> BoxMap:
     """Return a map with derived ground; the same map if it has streets, pavements or squares, or no buildings."""
     standing = box_map.select(blocks_walking(box_map) & (box_map.kinds == KINDS["Buildings"]))
     if len(standing) == 0 or box_map.is_any_of(PAVED_KINDS).any():
+        reason = "the map has streets, pavements or squares" if len(standing) else "the map has no buildings"
+        log.info("no ground is derived, because %s", reason)
         return box_map
     boxes = BoxList()
     if not (box_map.kinds == KINDS["Terrain"]).any():
@@ -226,6 +236,6 @@ def with_derived_ground(box_map: BoxMap) -> BoxMap:
     changes = {
         "derived_ground": len(derived),
         "added_boxes": header.added_boxes + len(derived),
-        "credits": f"{header.credits.rstrip('. ')}. {CREDITS}".removeprefix(". "),
+        "credits": credits_with(CREDITS, header.credits),
     }
     return replace(box_map.joined(derived), header=header.model_copy(update=changes))

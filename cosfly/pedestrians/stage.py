@@ -59,7 +59,10 @@ UNUSED_SHARE = 0.01  # of the walkable ground; less is not worth a line of the l
 LONGER_SIDE_PX = 1600
 OBSTACLE, MARGIN, UNUSED, USED = (74, 76, 84), (158, 158, 164), (232, 228, 218), (190, 219, 238)
 ON_ROAD, ON_CROSSING, ROI_LINE = (203, 201, 214), (246, 226, 150), (226, 120, 20)
-CAPTION = "dark: obstacles, grey: margin, blue: walkable, violet: carriageway, yellow: crossings, orange: region"
+CAPTION = (
+    "dark: obstacles, grey: margin, beige: other ground, blue: walkable, violet: carriageway, yellow: crossings, "
+    "orange: region"
+)
 
 
 class PedestrianResult(NamedTuple):

@@ -120,7 +120,7 @@ class WorldPlan(BaseModel):
     heights_m: Range = Field((8.0, 24.0), description="heights of other buildings")
     highest_m: float | None = Field(None, ge=3.0, le=450.0, description="no building is higher; null: no limit")
     building_share: Range = Field((0.0, 0.8), description="ground that buildings cover, of the town without water")
-    gap_m: float = Field(3.0, ge=0.5, le=40.0, description="between neighbouring buildings")
+    gap_m: float = Field(3.0, ge=0.05, le=40.0, description="between neighbouring buildings")
     setback_m: float = Field(1.0, ge=0.0, le=15.0, description="from pavement to front; from 2.5 on there are gardens")
     trees_per_ha: Range = Field((10.0, 60.0), description="trees on a hectare of the town without water")
     plazas: int = Field(1, ge=0, le=20, description="paved open blocks")

@@ -27,9 +27,10 @@ def _longest_first(words: Iterable[str]) -> list[str]:
 
 
 WORDS = read_yaml(Path(__file__).with_name("words.yaml"))
-STOPS = set(_words(WORDS["stops"]))
+POSITIONS = set(_words(WORDS["positions"]))
+STOPS = set(_words(WORDS["stops"])) | POSITIONS
 ORDINARY = set(_words(WORDS["ordinary"]))
-FIELD_BOUNDS = {"gap_m": (0.5, 40.0), "street_m": (5.0, 40.0), "avenue_m": (5.0, 60.0), "parked_share": (0.0, 0.9)}
+FIELD_BOUNDS = {"gap_m": (0.05, 40.0), "street_m": (5.0, 40.0), "avenue_m": (5.0, 60.0), "parked_share": (0.0, 0.9)}
 SEVERAL, SEVERAL_OPEN = 4, 3  # objects, and open blocks, of a plural without a number
 STOREY_M = 3.2
 VARIED = {"blocks_along": (0.92, 1.08), "block_m": (0.85, 1.2), "gap_m": (0.92, 1.08)}  # range of random factors
@@ -60,7 +61,11 @@ _HEIGHTS = {
     "at_least": rf"(?:at least|more than|over|above|minimum) {_HEIGHT}",  # "over 40 m tall"
     "exactly": _HEIGHT,  # "3-storey"
 }  # fmt: skip
-_EXCEPT = r"(?:except(?: for)?|other than|apart from|but(?= (?:the|a)\b))"
+# "but the church", "but the church may be higher", not "but the square is paved"
+_EXCEPT = (
+    r"(?:except(?: for)?|other than|apart from"
+    r"|but(?= (?:the|an?)(?: (?!is|are|may|can)[\w-]+){1,3}(?:[,.]| $| (?:is|are|may be|can be) (?:higher|taller))))"
+)
 _SIZES = {
     "sides": rf"{_NUMBER} ?(?:{_LENGTH})? ?(?:x|×|by|times) ?{_NUMBER} ?{_LENGTH}",  # "600 x 400 m"
     "square": rf"{_NUMBER} ?{_LENGTH} (?:square\b|across|on (?:a|each) side)",  # "500 m across"
@@ -88,6 +93,7 @@ def _normalized(prompt: str) -> str:
         text = re.sub(rf"\b{word}\b", str(WORDS["numbers"][word]), text)
     for plain, pattern in (
         ("1-stor", r"\bsingle[- ]stor"), ("hotel-buildings", r"(?<!\d )\bhotels\b"),
+        (r"apartment block\1", r"\bblock(s?) of flats\b"), ("apartments", r"\bflats\b"),
         (r"\1s of at most", r"\bthe (?:tallest|highest) (house|building)s? (?:is|are|has)\b"),
         # "no building except the church is higher than 12 m"
         (r"except\2, \1 is", rf"\b((?:no|none|nothing)(?: \w+)?),? {_EXCEPT}((?: \w+){{1,4}}),? is\b"),
@@ -221,7 +227,7 @@ class _Reader:
         while match := self._take(_CARS):  # before the words of cars: "5 parked cars" are not many
             self.not_used.append(match[0].strip())
         while match := self._take(_ABSENT):  # before the nouns: "without towers" names no tower
-            self.absent += f"{match[1]}, "
+            self.absent += f"{match[1].strip()}, "
         self.objects = self._take_objects()  # before buildings: a clock tower is no tower
         for word in _words(WORDS["lacking"]):  # before buildings: a control tower is none either
             if match := self._take(rf"(?:\b\d+ )?\b{word}s?\b"):
@@ -297,6 +303,8 @@ class _Reader:
                 self.plan[field] = max(self.plan[field], self._within(f"number of {word}s", count, 1, most))
         has_open = self.text != text_before
         self._take_words(",".join(WORDS["water"]))
+        if self.plan["river_m"] and re.search(r"(?:^|, )(?:rivers?|canals?|streams?), ", self.absent):
+            self.not_respected.append("no river: other water, such as a harbour, is built as a river")
         if "bridge" in self.objects:
             self.plan["bridges"] = self._within("number of bridges", self.objects["bridge"], 1, 10)
             self.plan["river_m"] = self.plan["river_m"] or WORDS["water"]["river"][1]
@@ -307,9 +315,12 @@ class _Reader:
     def _left_over(self) -> list[str]:
         """Return the phrases that are left in the text: words between stops and ordinary words."""
         phrases = list[str]()
+        positions = list[str]()
         for part in re.split(r"[.,;:()!?|'\"]", self.text):
             phrase = list[str]()
             for word in [*part.split(), "the"]:  # a stop, which ends the last phrase
+                if word in POSITIONS:
+                    positions.append(word)
                 if word in STOPS or word in ORDINARY or word.removesuffix("s") in ORDINARY:
                     if phrase:  # "40 cars" leaves "40 (of cars)"
                         noun = f" (of {word})" if word not in STOPS and phrase[-1].isdigit() else ""
@@ -317,7 +328,7 @@ class _Reader:
                     phrase = []
                 elif word != "1" or phrase:  # the number of "one avenue" says nothing
                     phrase.append(word)
-        return phrases
+        return [*phrases, *(f"{word} (position)" for word in dict.fromkeys(positions))]
 
     # --- fields of the plan ---
 
@@ -328,6 +339,8 @@ class _Reader:
             row = WORDS["buildings"][name]
             footprint_m = row.get("footprint_m", self.plan["footprint_m"])
             heights_m = _scaled(row["heights_m"], factor) if "heights_m" in row else self.plan["heights_m"]
+            if count is None and "gap_m" in row:
+                self.plan["gap_m"] = row["gap_m"]
             group = {"name": name, "count": count, "footprint_m": footprint_m, "heights_m": heights_m}
             self.plan["buildings"].append(group)
             is_main = not row.get("landmark") or name in _words(settlement.get("consists_of", ""))

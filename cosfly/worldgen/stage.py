@@ -21,7 +21,7 @@ from cosfly.maps.simworld import PLACEHOLDER_CM
 from cosfly.runtime.config import Config, read_yaml, shipped
 from cosfly.runtime.errors import InputError, TeacherError, counts_text
 from cosfly.runtime.io import sha256_bytes, write_bytes
-from cosfly.runtime.json_io import FileFormat, validated, write_json, write_model
+from cosfly.runtime.json_io import FileFormat, read_model, validated, write_json, write_model
 from cosfly.runtime.model_json import find_object
 from cosfly.runtime.run_dir import StageFolder, Tally, hold_folder
 from cosfly.viz.topview import TopView, draw_labels, draw_map, png_bytes
@@ -59,6 +59,7 @@ class WorldConfig(Config):
     """A world from text."""
 
     prompt: str = Field("", description="description of the world, in plain English; a language model may take others")
+    plan: Path | None = Field(None, description="plan.json of another world, edited or not, in place of a prompt")
     name: str = Field("TextWorld", min_length=1, max_length=60, description="name of the world's map")
     planner: str | None = Field(
         None, description="URL of the language model that plans the world; empty: built-in rules plan it"
@@ -171,21 +172,24 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
 
 
 def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
-    """Make a world from a prompt; return the path of its file, `combined_world.json`, with Bbox.json next to it.
+    """Make a world from a prompt or a plan; return the path of `combined_world.json`, which has Bbox.json next to it.
 
     The other products: trace.json, plan.json, layout.json, placement.json, checks.json, map.png, and loop.yaml, the
     settings for `cosfly run` on the world.
     """
     prompt = " ".join(cfg.prompt.split())
-    if not re.search(r"\w", prompt) or len(prompt) > MOST_CHARACTERS:
+    if not cfg.plan and (not re.search(r"\w", prompt) or len(prompt) > MOST_CHARACTERS):
         expected = f"1 to {MOST_CHARACTERS} characters, such as 'a small village with a church'"
         got = f"{len(prompt)} characters"
         raise InputError("the prompt is empty or too long", where="PROMPT", got=got, expected=expected)
-    stage = StageFolder.open(out, "world", config=cfg, inputs={}, seed=seed)
+    inputs = {"plan": cfg.plan} if cfg.plan else {}
+    stage = StageFolder.open(out, "world", config=cfg, inputs=inputs, seed=seed)
     product = out / WORLD_FILE
     if stage.is_complete:
         return product
-    if cfg.planner:
+    if cfg.plan:
+        plan, trace = read_model(cfg.plan, WorldPlan, PLAN_FORMAT), {"planner": "file", "not_used": []}
+    elif cfg.planner:
         plan, trace = plan_by_model(cfg, prompt, seed, out.parent / "answers")
     else:
         plan, trace = plan_by_rules(prompt, seed)
@@ -216,6 +220,7 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     files = ("trace.json", "plan.json", "layout.json", "placement.json", WORLD_FILE, SIZES_FILE, "checks.json")
     outputs = [out / name for name in (*files, "map.png", LOOP_FILE)]
     stage.finish(outputs, tally, num_boxes=len(town.boxes), is_valid=all(check["is_met"] for check in checks))
+    log.info("to change the town, edit a copy of %s, then: cosfly world COPY --out NEW", out / "plan.json")
     log.info("make a data set of it with: cosfly run %s --out %s", out / LOOP_FILE, out / "run")
     return product
 
