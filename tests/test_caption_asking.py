@@ -227,5 +227,8 @@ def test_a_trial_shows_questions_answers_and_outcomes_and_keeps_the_answers(tree
         )
     assert text.count(", no json object) ---") == 3
     assert "fix: remove caption.endpoint.json_schema=false" in text
+    with deciding("ascend", lambda index, body: "wrong_therefore" if index == 0 else None) as server:
+        text = "\n".join(show_windows(settings(server.url), tree, tmp_path / "corrected", 1))
+    assert text.count("[as in request 1]") == 2  # the system prompt and the flight data, not the complaint
     with pytest.raises(ConfigError, match="asks no model"):
         list(show_windows(CaptionConfig(), tree, tmp_path / "out", 1))

@@ -215,9 +215,10 @@ def test_a_contradicted_value_is_asked_for_again_with_the_measured_ones(tree, tm
 def test_a_failed_correction_leaves_no_checks_of_the_refused_answer(tree, tmp_path):
     with (
         writing_server("The gap of 47.5 m calls for it.", "The gap of {gap} calls for it.") as server,
-        pytest.raises(NothingKept),
+        pytest.raises(NothingKept, match=r"rejected answers: contradicted_value 2, invalid_slot 4"),
     ):
         run(settings(server.url, limit=2), tree, tmp_path / "out")
+    assert report_of(tmp_path / "out")["rejected_answers"] == {"contradicted_value": 2, "invalid_slot": 4}
     for caption in read_captions(tmp_path / "out" / "captions.jsonl"):
         assert (caption.drop_reason, caption.checks.refused[0]) == ("invalid_slot", "contradicted_value")
         assert (caption.en, caption.verdict) == (None, None)

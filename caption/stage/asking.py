@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from caption.schema import CaptionConfig, Window
-from caption.stage.ledger import explain_drops
+from caption.stage.ledger import explain_drops, rejections_of
 from caption.stage.tracks import TrackInput
 from caption.stage.window_loop import caption_window
 from caption.teachers.judge import Judge, open_judge
@@ -80,7 +80,9 @@ class Asking:
         self.begun: dict[TrackInput, list[asyncio.Task[Caption | None]]] = {}  # the windows of tracks in work
         self.num_failed_in_row = 0
         self.has_accepted = False  # a caption, in this run or an earlier one
-        self.dropped = Counter[str]()  # captions of this run by reason, before the first accepted one
+        # Captions of this run by reason, and rejected answers by code, before the first accepted caption.
+        self.dropped = Counter[str]()
+        self.rejected = Counter[str]()
 
     async def run(self, tracks: list[TrackInput]) -> AskingOutcome:
         """Ask about every window that has no answer yet; TeacherError if no window would get one. Answers are kept."""
@@ -254,11 +256,13 @@ class Asking:
         if self.has_accepted or not limit or not caption.attempts:
             return
         self.dropped[str(caption.drop_reason)] += 1
+        self.rejected.update(rejections_of(caption))
         if self.dropped.total() == limit:
             what = f"none of the first {limit} windows was accepted"
             see = f"to see why, read {self.stage.path / ANSWERS}/*.jsonl or run `cosfly caption doctor`"
             fix = f"{see}; to continue anyway, pass --set caption.stop_after_dropped=0"
-            raise TeacherError(what, where=self.cfg.teacher, got=explain_drops(self.dropped), fix=fix)
+            got = explain_drops(self.dropped, self.rejected)
+            raise TeacherError(what, where=self.cfg.teacher, got=got, fix=fix)
 
 
 def read_quarantine(stage_path: Path) -> dict[str, Failed]:

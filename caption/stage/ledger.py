@@ -12,6 +12,7 @@ from cosfly.formats.captions import TOKENS, Caption, TeacherRecord, Usage, Value
 from cosfly.formats.frames import frame_name
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import Answer, BudgetConfig, journal_of
+from cosfly.runtime.errors import counts_text
 from cosfly.runtime.io import read_text, sha256_bytes
 from cosfly.runtime.json_io import FileFormat
 from cosfly.runtime.run_dir import Tally
@@ -34,7 +35,8 @@ REASONS = {
     "regeneration_failed": "the decision was in conflict, and no regenerated answer was accepted; see `checks.refused`",
     "decision_mismatch": "the reasoning leads to another action than the decision",
     "contradicted_value": "a number of the text contradicts the measured facts; see `checks.contradictions`",
-    "invalid_slot": "a slot names no known fact of the window, or its braces, unit or side do not fit",
+    "invalid_slot": "a slot names no known fact of the window, or its braces, unit or side do not fit; "
+    "try caption.writing=prose",
     "no_reason": "no observed fact supports a decision, or the label in a regeneration",
     "bilingual": "the two languages do not say the same; see `checks.bilingual`",
 }
@@ -45,10 +47,20 @@ def most_common(counts: Mapping[str, int]) -> dict[str, int]:
     return dict(sorted(counts.items(), key=lambda pair: (-pair[1], pair[0])))
 
 
-def explain_drops(dropped: Mapping[str, int]) -> str:
-    """Return the three most common reasons with their counts and meanings."""
+def rejections_of(caption: Caption) -> list[str]:
+    """Return the codes of why answers of a window were rejected, one for each answer."""
+    return [reason.partition(":")[0] for reason in caption.checks.refused or ()]
+
+
+def explain_drops(dropped: Mapping[str, int], rejected: Mapping[str, int]) -> str:
+    """Return the three most common reasons with their counts and meanings; rejected: answers by code."""
     reasons = list(most_common(dropped).items())[:3]
-    return "; ".join(f"{count} {reason}: {REASONS[reason]}" for reason, count in reasons)
+    texts = [f"{count} {reason}: {REASONS[reason]}" for reason, count in reasons]
+    if rejected:
+        texts.append(f"rejected answers: {counts_text(most_common(rejected))}")
+    if "invalid_slot" in rejected and "invalid_slot" not in dropped:
+        texts.append(f"invalid_slot: {REASONS['invalid_slot']}")
+    return "; ".join(texts)
 
 
 def problems_of(caption: Caption) -> list[tuple[str, str]]:
@@ -90,6 +102,7 @@ class CaptionReport(BaseModel, extra="forbid"):
     repair: RepairCounts = RepairCounts()
     judgements: Counts = Counter()
     structure: Counts = Counter()
+    rejected_answers: Counts = Counter()  # of the right structure
     bilingual: Counts = Counter()
     writing: Counts = Counter()  # of accepted captions
     values: dict[str, Counts] = {}  # language -> values_filled, values_matched, values_contradicted
@@ -130,6 +143,7 @@ class CaptionReport(BaseModel, extra="forbid"):
             self.values.setdefault(language, Counter()).update(counts.model_dump())
         self.contradicted_captions += checks.contradictions is not None
         self.structure.update([checks.structure] if checks.structure else [])
+        self.rejected_answers.update(rejections_of(caption))
         self.bilingual.update([checks.bilingual] if checks.bilingual else [])
         self.recovered.update(checks.recovered or ())
         if caption.status == "accepted":

@@ -28,7 +28,7 @@ from cosfly.runtime.errors import ConfigError, ResumeError, TeacherError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import write_model
 from cosfly.runtime.pool import Watch, run_items
-from cosfly.runtime.run_dir import StageFolder, Tally, read_manifest
+from cosfly.runtime.run_dir import StageFolder, read_manifest
 from cosfly.runtime.worker import Item, Outcome, Work, advance
 from cosfly.viz.page import run_name
 
@@ -91,7 +91,7 @@ def run(
         log.warning("caption: %d captions of %s match no window of this tree", len(unused), cfg.caption_file)
     for warning in report.warnings():
         log.warning("caption: %s", warning)
-    _finish(stage, cfg, vocabulary, outcome, report.windows, is_cut)
+    _finish(stage, cfg, vocabulary, outcome, report, is_cut)
     return out / PRODUCT
 
 
@@ -120,10 +120,11 @@ def _write_report(
 
 
 def _finish(
-    stage: StageFolder, cfg: CaptionConfig, vocabulary: Vocabulary, outcome: AskingOutcome, tally: Tally, is_cut: bool
-) -> None:
+    stage: StageFolder, cfg: CaptionConfig, vocabulary: Vocabulary, outcome: AskingOutcome, report: CaptionReport,
+    is_cut: bool,
+) -> None:  # fmt: skip
     """Finish the stage if every window has an outcome; TeacherError if one should have got an answer."""
-    out = stage.path
+    out, tally = stage.path, report.windows
     if outcome.stopped:
         got = f"{outcome.stopped}; {tally.kept} windows accepted so far"
         fix = "raise --max-cost or --max-tokens and run the same command again; answered windows are not asked again"
@@ -136,7 +137,7 @@ def _finish(
         num_frames = cfg.window.num_frames + cfg.window.future_frames
         raise stage.nothing_kept(outcome.tracks, expected=f"a track of at least {num_frames} frames")
     if not tally.kept:
-        causes = explain_drops(tally.dropped + tally.failed)
+        causes = explain_drops(tally.dropped + tally.failed, report.rejected_answers)
         fix = f"{causes}; use another model or other settings, and another --out"
         raise stage.nothing_kept(tally, where=out / PRODUCT, fix=fix)
     outputs = [out / PRODUCT, out / REPORT, out / PAGE, *sorted((out / ANSWERS).glob("*.jsonl"))]

@@ -101,11 +101,12 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
     for (sample_id, of_window), outcome in zip(exchanges.items(), outcomes, strict=True):
         yield f"=== {sample_id} ==="
         previous = None
+        shown: dict[str, int] = {}
         for number, (request, reply) in enumerate(of_window, 1):
             if request.messages == previous:
                 yield f"--- request {number}, the same with another seed ---"
             else:
-                yield from _question_lines(number, request)
+                yield from _question_lines(number, request, shown)
             yield from _answer_lines(number, reply)
             previous = request.messages
         yield "--- outcome ---"
@@ -133,15 +134,20 @@ def _outcome_lines(caption: Caption) -> Iterator[str]:
     yield from (f"{name}: {for_terminal(text)}" for name, text in facts if text is not None)
 
 
-def _question_lines(number: int, request: Request) -> Iterator[str]:
-    """Yield the lines of a question; a picture is a line with its number and size."""
+def _question_lines(number: int, request: Request, shown: dict[str, int]) -> Iterator[str]:
+    """Yield the lines of a question; a picture is a line with its number and size.
+
+    A long text of an earlier request of this window is a line with the number of that request; `shown` collects them.
+    """
     for message in request.messages:
         yield f"--- request {number}, {message['role']} ---"
         content, num_pictures = message["content"], 0
         parts: list[dict] = [{"type": "text", "text": content}] if isinstance(content, str) else content
         for part in parts:
             if part["type"] == "text":
-                yield for_terminal(part["text"], LONGEST_LOG)
+                text = part["text"]
+                first = shown.setdefault(text, number) if len(text) > MOST_LOGGED else number
+                yield for_terminal(text, LONGEST_LOG) if first == number else f"[as in request {first}]"
             else:
                 num_pictures += 1
                 yield f"[picture {num_pictures}, {len(part['image_url']['url']) / 1e3:.0f} kB]"
