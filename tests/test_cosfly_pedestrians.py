@@ -19,7 +19,7 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths
 from cosfly.formats.roi import Roi
 from cosfly.geometry.axes import DT_S
 from cosfly.maps.boxlist import BoxList
-from cosfly.pedestrians.astar import _line_cost
+from cosfly.pedestrians.astar import _line_cost, corners_of
 from cosfly.pedestrians.bystanders import bystanders_of, gaps_m
 from cosfly.pedestrians.speed_model import PACES, TimedRoute, take_pace
 from cosfly.pedestrians.stage import PedestriansConfig, follow_route, make_pedestrian, run, walkable_ground
@@ -124,6 +124,15 @@ def test_a_line_crosses_the_cells_that_geometry_says():
             num_blocked += 1
         assert _line_cost(start, end, free, classes, costs) == pytest.approx(expected)
     assert 50 < num_blocked < 250
+
+
+def test_a_straightened_route_around_a_pond_has_few_corners():
+    """Half around a pond of 25 cells, at 27 cells: without the cost of a corner there are eight, not six."""
+    y, x = np.mgrid[:61, :61]
+    angles = np.linspace(0.0, np.pi, 400)
+    ring = np.round(30 + 27 * np.column_stack([np.cos(angles), np.sin(angles)])).astype(np.int64)
+    cells = ring[np.any(np.diff(ring, axis=0, prepend=-1), axis=1)]
+    assert len(corners_of(cells, np.hypot(x - 30, y - 30) > 25, np.zeros_like(x), np.ones(4))) == 6
 
 
 def test_people_walk_straight_where_the_ground_allows_it(tmp_path):

@@ -229,9 +229,7 @@ def test_a_signal_ends_a_command_and_its_workers_in_one_line(tmp_path, until, nu
     os.killpg(process.pid, number)  # what a terminal and a service manager do
     text, _ = process.communicate(timeout=60)
     assert process.returncode == 128 + number
-    assert text.splitlines() == [
-        f"error: {word}; work in an output directory is kept; run the same command again to resume"
-    ]
+    assert text.splitlines() == [f"error: {word}; finished work is kept; run the same command again to resume"]
 
 
 @pytest.mark.slow

@@ -359,7 +359,7 @@ def test_the_record_is_what_the_flights_are(canyon, tmp_path_factory):
         assert {trace.planner for trace in traces} == {planner}
         seen = np.mean([trace.visibility.mean() for trace in traces])
         assert record["means"][planner]["five_ray_mean"] == pytest.approx(seen, abs=1e-4)
-        assert record["means"][planner]["blocked_fraction"] == pytest.approx(1 - seen, abs=1e-3)
+        assert record["means"][planner]["blocked_rays"] == pytest.approx(1 - seen, abs=1e-3)
         assert record["means"][planner]["collision_fraction"] == 0
         assert manifest["timings"][planner]["mean_ms"] > 0
     assert record["win_rates"]["muco"]["both_collision_free"] == {"count": 2, "of": 2, "rate": 1.0}

@@ -55,7 +55,7 @@ def main() -> None:
         # A KeyboardInterrupt arrives here only before Typer has started, which catches it and exits with 130.
         code = end.code if isinstance(end, SystemExit) else 130
         if code in ENDED:
-            _fail(f"{ENDED[code]}; work in an output directory is kept; run the same command again to resume", code)
+            _fail(f"{ENDED[code]}; finished work is kept; run the same command again to resume", code)
         _end(code)
     except OSError as error:
         from cosfly.runtime.io import DISK_FULL

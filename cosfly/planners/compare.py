@@ -58,7 +58,7 @@ class Criterion(NamedTuple):
 
 SIGHT_AND_SAFETY = (
     FigureColumn("five_ray_mean", "visibility", 3),
-    FigureColumn("blocked_fraction", "blocked", 3),
+    FigureColumn("blocked_rays", "blocked rays", 3),
     FigureColumn("collision_fraction", "collision", 3),
     FigureColumn("clearance_min_m", "clearance, m", 2),
 )
@@ -73,8 +73,8 @@ FLIGHT = (
 )
 FIGURES = (*SIGHT_AND_SAFETY, *FLIGHT)
 NAMES = [column.name for column in FIGURES]
-NO_TRAJECTORY = {"five_ray_mean": 0.0, "blocked_fraction": 1.0, "collision_fraction": 1.0, "clearance_min_m": 0.0}
-PAPER_DELTAS = {"five_ray_mean", "blocked_fraction", "clearance_min_m", "length_m", "accel_rms_mps2", "jerk_rms_mps3"}
+NO_TRAJECTORY = {"five_ray_mean": 0.0, "blocked_rays": 1.0, "collision_fraction": 1.0, "clearance_min_m": 0.0}
+PAPER_DELTAS = {"five_ray_mean", "blocked_rays", "clearance_min_m", "length_m", "accel_rms_mps2", "jerk_rms_mps3"}
 AXES = ("visibility", "path_efficiency", "smoothness", "safety")
 AXES_AND_MEAN = (*AXES, "mean")
 GROUPS = {
@@ -99,9 +99,9 @@ Means = dict[str, dict[str, float]]  # planner -> mean figures or scores
 
 def trajectory_figures(trace: DroneTrace) -> dict[str, float]:
     """Return the figures of FIGURES of one drone trajectory."""
-    blocked_fraction = round(1.0 - trace.metrics["five_ray_mean"], 4)
+    blocked_rays = round(1.0 - trace.metrics["five_ray_mean"], 4)
     collision_fraction = round(float((trace.clearances_m < 0).mean()), 4)
-    figures = trace.metrics | {"blocked_fraction": blocked_fraction, "collision_fraction": collision_fraction}
+    figures = trace.metrics | {"blocked_rays": blocked_rays, "collision_fraction": collision_fraction}
     return {name: float(figures[name]) for name in NAMES}
 
 

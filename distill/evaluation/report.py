@@ -140,7 +140,8 @@ def tables_of(report: Evaluation, language: Language) -> list[TextTable]:
     for token in sorted(counts, key=lambda token: -counts[token]):
         cells = [_shown(token, figure_set.by_decision.get(token)) for figure_set in columns.values()]
         decisions.append([f"{token} ({counts[token]})", *cells])
-    heading = f"{LANGUAGES[language]}: {part.samples} samples of {part.walks} pedestrian trajectories"
+    trajectories = "trajectory" if part.walks == 1 else "trajectories"
+    heading = f"{LANGUAGES[language]}: {part.samples} samples of {part.walks} pedestrian {trajectories}"
     tables = [TextTable(heading, ["", *columns], main)]
     tables.append(TextTable("Accuracy by the teacher's decision", ["", *columns], decisions))
     for pairing in part.pairings:
