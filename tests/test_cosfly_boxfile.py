@@ -213,14 +213,17 @@ def test_openstreetmap_and_overture_need_the_name_of_the_type_column(tmp_path, c
         feature("MultiLineString", [way], highway="footway", width="2 m"),
         feature("Point", [4.3001, 52.0001], natural="tree"),
         feature("Point", [4.3002, 52.0001], amenity="bench"),
+        feature("LineString", way, highway="primary", tunnel="yes"),
+        feature("LineString", way, highway="footway", width="2 m", tunnel="building_passage"),
         feature("MultiPolygon", [square(4.302, 52.0, 1e-4)], building="church", **{"building:levels": "2"}),
     ]
     osm = loaded(tmp_path, collection(*town), ".geojson", type_column="building,highway,natural",
                  derive_pavements=False)  # fmt: skip
-    assert osm.counts() == {"Buildings": 10, "Roads": 2, "Sidewalks": 2, "Vegetation": 1}
+    assert osm.counts() == {"Buildings": 10, "Roads": 2, "Sidewalks": 4, "Vegetation": 1}
     assert_allclose(np.unique(2 * osm.half_extents[osm.kinds == 1][:, 1]), 7.0)
-    assert (osm.header.num_objects, osm.header.dropped_objects) == (14, {"unmapped_type": 1})
-    assert osm.header.extent_sources == {"file": 12, "default": 1, "levels": 1} | {"file": 13}
+    assert osm.header.num_objects == 16
+    assert osm.header.dropped_objects == {"unmapped_type": 1, "underground": 1}
+    assert osm.header.extent_sources == {"file": 15, "default": 1, "levels": 1}
     assert "1 a default size" in caplog.text
     of_ogr = [{**one, "properties": {"building": "yes", "other_tags": '"roof"=>"a \\"b\\"","height"=>"12 m"', "height": None}}
               for one in houses(*at, DEGREES)]  # fmt: skip

@@ -62,6 +62,7 @@ OTHERS = ("z_m", "yaw_deg", "building:levels", "building:min_level", "lanes")
 PLACE = ("x_m", "y_m", "length_m", "width_m")  # every table has them; and height_m, except of surfaces
 TYPES = [kind for kind in KINDS if kind != "NONE"]
 GEOMETRIES = ("Point", "LineString", "Polygon", "MultiPoint", "MultiLineString", "MultiPolygon")  # of GeoJSON
+NOT_MAPPED = ("unmapped_type", "underground")  # reasons to skip a valid feature
 WITHOUT_PAVEMENT = ("no", "none", "separate")  # values of `sidewalk`; separate: mapped as a way of its own
 LARGEST_PLACE = 1e8  # absolute value of a coordinate of GeoJSON, in any unit
 MOST_NAME = 40  # characters of a name in messages
@@ -345,7 +346,7 @@ def _make_boxes(rows: list[_Row], cfg: BoxesConfig) -> _BoxesOfRows:
             source = _add_row(boxes, row, cfg, made.repairs)
         except _Skipped as error:
             del boxes.rows[num_before:], boxes.kinds[num_before:]
-            made.dropped.add(error.reason, row.where, str(error), is_bad=error.reason != "unmapped_type")
+            made.dropped.add(error.reason, row.where, str(error), is_bad=error.reason not in NOT_MAPPED)
         else:
             made.size_sources[source] += len(boxes) - num_before
             made.row_of_box += [index] * (len(boxes) - num_before)
@@ -364,7 +365,7 @@ def _check_and_report(made: _BoxesOfRows, rows: list[_Row], ids: list[int], cfg:
         f"at most {cfg.most_skipped:.0%} invalid rows (maps.boxes.most_skipped); columns {', '.join(COLUMNS)}; "
         f"types {', '.join(TYPES)}, or types listed in maps.boxes.types"
     )
-    dropped.check(path, len(rows) - dropped.counts["unmapped_type"], cfg.most_skipped, expected)
+    dropped.check(path, len(rows) - sum(dropped.counts[reason] for reason in NOT_MAPPED), cfg.most_skipped, expected)
     if made.repairs:
         log.warning("%s: %s", path.name, listed(made.repairs, "the outline crosses itself and is repaired"))
     if made.size_sources["levels"] or made.size_sources["default"]:
@@ -597,6 +598,8 @@ def _kind_of(row: _Row, cfg: BoxesConfig) -> str:
         return kind
     if cfg.is_plain:
         raise _Skipped("unknown_type", f"unknown type {name[:MOST_NAME]!r}{nearest(name, [*TYPES, *cfg.types])}")
+    if (row.values.get("tunnel") or "no") not in ("no", "building_passage"):
+        raise _Skipped("underground", "it is in a tunnel")
     for rule in TYPE_RULES:
         if rule.covers(column, name, row.shape.geom_type):
             if rule.kind in TYPES:
