@@ -1,4 +1,4 @@
-"""Steps 2 to 4: times of simplification, pedestrian trajectories and planners; MuCO next to scipy's L-BFGS-B.
+"""Steps 2 to 4: times of simplification, pedestrian trajectories and planners.
 
 python tests/benchmarks/bench_planning.py [--maps a b] [--planners muco ...]
 """
@@ -11,14 +11,12 @@ from typing import Any
 
 import numpy as np
 import scenes
-from specimens_planning import solved_by_scipy
 
 from cosfly.formats.boxes import BoxMap, write_boxes
 from cosfly.geometry.kernels import BoxIndex, obstacle_index
 from cosfly.pedestrians.stage import PedestriansConfig, make_pedestrian, run, walkable_ground
 from cosfly.pedestrians.walkable import WalkableGround
 from cosfly.planners.contract import PLANNERS, PlanConfig, Scenario, load_planner
-from cosfly.planners.muco import muco
 from cosfly.planners.stage import make_scenario
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.seeding import rng_for
@@ -111,31 +109,6 @@ def measure(scene: Scene, planner: str, cfg: PlanConfig) -> list:
     ]  # fmt: skip
 
 
-def compare_with_scipy(scene: Scene, cfg: PlanConfig) -> list:
-    """The same loss, start and bounds for both; times of the optimisation alone.
-
-    The rule that takes low-visibility runs out of the gradient is no part of the loss and is off for both.
-    """
-    rows, without_rule = [], cfg.muco.model_copy(update={"low_visibility_frames": 1_000_000})
-    for scenario in scene.scenarios:
-        problem = muco.make_problem(scenario, cfg)
-        first, _ = muco.start_trajectory(scenario, problem, scene.obstacles, cfg)
-        ms, (_, solver, _) = scenes.cpu_ms(
-            lambda f=first, p=problem: muco.optimize(f, p, scene.obstacles, without_rule)
-        )
-        peer_ms, peer = scenes.cpu_ms(
-            lambda f=first, p=problem: solved_by_scipy(f, p, scene.obstacles, maxiter=3000, maxfun=6000)
-        )
-        rows.append((ms, peer_ms, solver["loss_end"] / peer.fun))
-    table = np.array(rows)
-    return [
-        scene.name, float(table[:, 0].mean()), float(table[:, 1].mean()),
-        f"{table[:, 1].mean() / table[:, 0].mean():.1f}",
-        f"{np.median(table[:, 2]):.3f}", f"{table[:, 2].max():.3f}",
-        f"{int((table[:, 2] <= 1.05).sum())} of {len(table)}",
-    ]  # fmt: skip
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--maps", nargs="+", default=["a", "b"], choices=["a", "b"])
@@ -152,8 +125,6 @@ def main() -> None:
     print()
     names = ["map", "planner", "obstacles", "trajectories", "points", "mean ms", "p95 ms", "max ms"]
     scenes.print_table("planning, start included", names, rows)
-    names = ["map", "MuCO, ms", "L-BFGS-B, ms", "times faster", "median loss ratio", "greatest", "within 5 %"]
-    scenes.print_table("the same loss from the same start", names, [compare_with_scipy(s, cfg) for s in found])
 
 
 if __name__ == "__main__":
