@@ -33,7 +33,8 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.formats.playback import Perturbation, TargetRecord, Track
 from cosfly.formats.playback_file import write_track
-from cosfly.geometry.axes import DT_S, box_corners, intrinsic_matrix, look_at, project, world_from_camera
+from cosfly.geometry.axes import DT_S, intrinsic_matrix, look_at, world_from_camera
+from cosfly.render.camera import view_target
 
 PERSON_ID = 0x1234  # two different bytes, so that a swap of the channels shows
 FIRST_SECOND = 1_776_047_127
@@ -108,15 +109,18 @@ def make_flight(
     # A shifted camera is aimed anew, as the renderer aims it.
     rotations[:, :2] += np.degrees(np.subtract(look_at(positions, targets), aimed_before).T)
     camera = Camera(width_px, height_px, intrinsic_matrix(width_px, height_px, 60.0))
-    views = [_annotate(scene, targets[i], positions[i], rotations[i], camera) for i in range(num_points)]
-    bbox = np.array([view[0] for view in views])
-    visibility = np.array([view[3] for view in views])
+    poses = map(world_from_camera, positions, rotations)
+    views = [view_target(target, pose, camera) for target, pose in zip(targets, poses, strict=True)]
+    in_view = np.array([view.in_view for view in views])
+    shares = [_visible_share(scene, target, position) for target, position in zip(targets, positions, strict=True)]
+    visibility = np.where(in_view, shares, 0.0)
     flight = Track(
         town=town, trajectory=trajectory, variant=variant, camera=camera, time_s=np.arange(num_points) * DT_S,
         positions_m=positions, rotations_deg=rotations, targets_m=targets,
         target=TargetRecord(
-            in_view=~np.isnan(bbox[:, 0]), visible=visibility >= 0.3, depth_m=np.array([view[2] for view in views]),
-            uv=np.array([view[1] for view in views]), bbox=bbox, visibility=visibility,
+            in_view=in_view, visible=visibility >= 0.3, depth_m=np.array([view.depth_m for view in views]),
+            uv=np.where(in_view[:, None], [view.uv for view in views], np.nan),
+            bbox=np.array([view.bbox_px for view in views]), visibility=visibility,
         ),
         perturbation=Perturbation(np.full(num_points, variant != "ORI"), drone_offsets, rotation_offsets, zero.copy()),
         source={
@@ -183,19 +187,6 @@ def _scene(targets: np.ndarray, positions: np.ndarray, rng: np.random.Generator)
     kinds.append(KINDS["Walls"])
     ids = np.arange(1, len(centers) + 1)
     return Scene(np.array(centers), np.array(halves), np.array(colors, np.uint8), np.array(kinds), ids)
-
-
-def _annotate(scene: Scene, target: np.ndarray, position: np.ndarray, rotation: np.ndarray, camera: Camera) -> tuple:
-    """Give bbox (4,), uv (2,), z-depth and visibility of the person; NaN where out of view."""
-    pose = world_from_camera(position, rotation)
-    uv, depth = project(target[None], pose, camera.intrinsic)
-    corners, _ = project(box_corners(target, np.array(PERSON_HALF_EXTENTS_M)), pose, camera.intrinsic)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    size = np.array([camera.width_px, camera.height_px])
-    if not (np.isfinite(corners).all() and (high > 0).all() and (low < size).all()):
-        return np.full(4, np.nan), np.full(2, np.nan), float(depth[0]), 0.0
-    box = np.concatenate([np.clip(low, 0, size), np.clip(high, 0, size)])
-    return box, uv[0], float(depth[0]), _visible_share(scene, target, position)
 
 
 def _visible_share(scene: Scene, target: np.ndarray, position: np.ndarray) -> float:

@@ -297,8 +297,6 @@ def test_without_ompl_the_error_names_the_extra_and_the_planners_to_leave_out(in
     assert caught.value.fix == 'pip install -e ".[ompl]", or leave out the planners rrt_star, prm and bspline_prm'
 
 
-CFG = CompareConfig()
-
 # tab:appendix_h_tastar_muco_delta and tab:appendix_h_four_axis_scores of the paper.
 DELTAS_OF_PAPER = {
     "track_astar": {"five_ray_mean": 0.979, "length_m": 104.479, "accel_rms_mps2": 0.673, "jerk_rms_mps3": 0.919,
@@ -341,13 +339,9 @@ def test_deltas_are_the_papers():
     assert table["collision_fraction"] == {"delta": 0.0, "relative_percent": None}
 
 
-@pytest.fixture(scope="module")
-def canyon(tmp_path_factory):
+def test_the_record_is_what_the_flights_are_and_counts_what_one_planner_cannot_fly(tmp_path, monkeypatch):
     walks = {"a": [(0, 0), (30, 0)], "into_wall": [(60, -50), (60, -30)], "b": [(30, 2), (60, 2)]}
-    return written(tmp_path_factory.mktemp("inputs"), town_of(*CANYON, ((60, -40, 20), (5, 5, 20))), **walks)
-
-
-def test_the_record_is_what_the_flights_are_and_counts_what_one_planner_cannot_fly(canyon, tmp_path, monkeypatch):
+    inputs = written(tmp_path, town_of(*CANYON, ((60, -40, 20), (5, 5, 20))), **walks)
     real = compare.plan_trajectory
 
     def lame(walk, obstacles, cfg, *rest):
@@ -356,7 +350,7 @@ def test_the_record_is_what_the_flights_are_and_counts_what_one_planner_cannot_f
         return real(walk, obstacles, cfg, *rest)
 
     monkeypatch.setattr(compare, "plan_trajectory", lame)
-    record = json.loads(compare.run(CFG, *canyon, tmp_path / "out").read_text())
+    record = json.loads(compare.run(CompareConfig(), *inputs, tmp_path / "out").read_text())
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
     assert manifest["counts"] == {"input": 3, "kept": 2, "dropped": {}, "failed": {"no_path": 1}}
     assert [row["id"] for row in record["scenarios"]] == ["a", "b"]

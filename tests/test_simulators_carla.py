@@ -1,8 +1,6 @@
 """Maps and frames of a CARLA server, through the unmodified client, against the embedded renderer's."""
 
-import contextlib
 import json
-import queue
 import re
 import subprocess
 import sys
@@ -137,40 +135,6 @@ def test_depth_and_poses_survive_their_encodings():
         np.testing.assert_allclose(camera_rotation_deg(pose), turn, atol=1e-9)
         position, rotation = world_pose(unreal_pose(np.array([1.0, 2.0, 3.0]), np.array(turn)))
         np.testing.assert_array_equal(np.concatenate([position, rotation]), [1.0, 2.0, 3.0, *turn])
-
-
-def frames_of(port: int, num_ticks: int, num_pictures: int) -> list[int]:
-    """The numbers of the pictures of a depth camera, counted from the first tick, as they come; and of those that come
-    though no more should."""
-    import carla
-
-    client = carla.Client("127.0.0.1", port)
-    client.set_timeout(60.0)  # the first picture opens the server's renderer
-    world = client.get_world()
-    blueprint, inbox = world.get_blueprint_library().find("sensor.camera.depth"), queue.Queue()
-    for name, size_px in (("image_size_x", "160"), ("image_size_y", "96")):
-        blueprint.set_attribute(name, size_px)
-    camera = world.spawn_actor(blueprint, carla.Transform())
-    camera.listen(lambda image: inbox.put(image.frame))
-    inbox.get(timeout=60)  # the stream is open
-    settings = world.get_settings()
-    settings.synchronous_mode, settings.fixed_delta_seconds = True, 0.05
-    world.apply_settings(settings)
-    first, *_ = (world.tick() for _ in range(num_ticks))
-    came: list[int] = []
-    with contextlib.suppress(queue.Empty):
-        while True:
-            number = inbox.get(timeout=60.0 if len(came) < num_pictures else 2.0) - first + 1
-            came += [number] if number > 0 else []
-    return came
-
-
-@pytest.mark.slow
-def test_planted_faults_come_true(tmp_path):
-    """The client's first tick is that of its settings: here the second is 1."""
-    faults = ("drop:depth@3", "drop:rgb@4", "duplicate@4", "reorder:depth@5", "delay:depth@7=5", "drop@9+")
-    with serving(street(), tmp_path, *faults) as port:
-        assert as_client(frames_of, port, 9, 7) == [1, 3, 3, 5, 4, 7, 6]
 
 
 FRAMES = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0], "town": "Street", "first_timestamp": 1776000000}
