@@ -135,13 +135,6 @@ def test_a_held_command_is_reached_as_fast_as_the_drone_can_and_no_faster(airspa
     assert moments[-1].position_m[2] - moments[-2].position_m[2] == pytest.approx(0.5)
 
 
-def test_velocities_are_in_the_axes_of_the_drone(airspace, planned):
-    flight = ClosedLoopTrajectory(airspace, planned)
-    moments = after(flight, *[(0.0, 1.0, 0.0, 0.0)] * 4)
-    yaw = np.radians(moments[-1].rotation_deg[1])
-    assert moments[-1].velocity_mps == pytest.approx([-np.sin(yaw), np.cos(yaw), 0.0], abs=1e-6)
-
-
 def test_who_flies_into_the_ground_or_a_house_has_crashed_before_it_and_flies_no_more(airspace, planned):
     for command in ((0, 0, -4.0, 0), (0, 8.0, -2.0, 0)):
         flight = ClosedLoopTrajectory(airspace, planned)

@@ -256,7 +256,6 @@ class Word(Fine): answer = "fly!"
 class Beyond(Fine): answer = [99.0, 0, 0, 0, 0]
 class Seventeen(Fine): answer = 17
 class Nothing(Fine): answer = None
-class Object(Fine): answer = {"a": 1}
 class Raises(Fine):
     def act(self, observation): raise RuntimeError("oops")
 class Quits(Fine):
@@ -271,7 +270,6 @@ class Slow(Fine):
 class Complex(Fine): answer = np.zeros(5, complex)
 class BadReset(Fine):
     def reset(self, goal, seed): raise ValueError("no")
-class NoAct: pass
 """
 
 
@@ -296,7 +294,7 @@ def ask(follow, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "wanted"), [
-    ("Token", "ok"), ("Command", "ok"), ("Word", "invalid"), ("Beyond", "invalid"), ("Seventeen", "invalid"), ("Nothing", "unreadable"), ("Object", "unreadable"), ("Raises", "none"),
+    ("Token", "ok"), ("Command", "ok"), ("Word", "invalid"), ("Beyond", "invalid"), ("Seventeen", "invalid"), ("Nothing", "unreadable"), ("Raises", "none"),
     ("Quits", "none"), ("Never", "late"), ("BadReset", "none"), ("Complex", "unreadable"),
 ])  # fmt: skip
 def test_what_a_policy_does_is_told_as_its_answer(ask, name, wanted):

@@ -60,15 +60,11 @@ def nodes() -> Iterator[Nodes]:
     found.end()
 
 
-def quick(nodes: Nodes) -> Watch:
-    return replace(QUICK, ray=RayConfig(address=nodes.address))
-
-
 @pytest.mark.slow
 def test_workers_that_die_and_stall_once_cost_nothing_but_time(tmp_path, nodes, caplog):
     nodes.add(num_cpus=2)
     kinds = ["once-stop", "once-die", "once-sleep", "nothing", "nothing"]
-    watch = quick(nodes)
+    watch = replace(QUICK, ray=RayConfig(address=nodes.address))
     finished = run_items(stage_in(tmp_path), items_of(*kinds), make_faulty, (tmp_path / "s",), workers=2, watch=watch)
     assert [record.id for record in finished.kept] == [f"i{k}" for k in range(len(kinds))]
     events = read_events(tmp_path / "s")

@@ -28,8 +28,7 @@ def box_map(*rows, ids=None) -> BoxMap:
 
 def only(what: str, **settings_) -> SimplifyConfig:
     """Settings with one pass switched on."""
-    passes = dict.fromkeys(("merge", "crop_tree", "crop_below_ground", "prune_nested"), False)
-    return SimplifyConfig(**{**passes, what: True, **settings_})
+    return SimplifyConfig(**{**dict.fromkeys(PASSES[1:], False), what: True, **settings_})
 
 
 def random_map(seed: int, count: int, size_m: float = 30.0) -> BoxMap:
@@ -187,8 +186,7 @@ def test_stage_writes_map_report_and_picture(tmp_path: Path):
     write_boxes(source, boxes)
     product = run(SimplifyConfig(), source, tmp_path / "out")
     simplified = read_boxes(product)
-    found = [p.name for p in simplified.header.passes]
-    assert found == ["input", "merge", "crop_tree", "crop_below_ground", "prune_nested"]
+    assert [p.name for p in simplified.header.passes] == PASSES
     report = json.loads((tmp_path / "out/simplify_report.json").read_text())
     assert report["num_boxes"] == {"raw": 120, "simplified": len(simplified)}
     assert report["passes"][-1]["counts"] == simplified.counts()

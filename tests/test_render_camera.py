@@ -53,15 +53,11 @@ def test_a_flight_goes_from_level_to_level():
     assert focal[22] == pytest.approx(np.sqrt(focal[20] * focal[24])), "halfway the picture is halfway larger"
 
 
-def zooming():
-    flight, _ = make_flight(8)
+def test_the_cameras_of_a_flight_survive_the_file(tmp_path):
+    flight, folder = make_flight(8)[0], tmp_path / "Town01/trajectory_1/ORI"
     intrinsics = np.tile(flight.camera.intrinsic, (8, 1, 1))
     intrinsics[:, [0, 1], [0, 1]] *= np.linspace(1.0, 2.0, 8)[:, None]
-    return replace(flight, intrinsics=intrinsics)
-
-
-def test_the_cameras_of_a_flight_survive_the_file(tmp_path):
-    flight, folder = zooming(), tmp_path / "Town01/trajectory_1/ORI"
+    flight = replace(flight, intrinsics=intrinsics)
     folder.mkdir(parents=True)
     write_track(folder, flight)
     found = read_track(folder)

@@ -18,7 +18,6 @@ from test_renderers_contract import circling, street, write_inputs
 from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.formats.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.traces import DroneTrace
 from cosfly.formats.tracks import find_tracks
 from cosfly.formats.weather import WeatherParams
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
@@ -142,17 +141,12 @@ CLEAN = {**FRAMES, "tracks": ["clean"]}
 QUICK = {"timeout_s": 60.0}
 
 
-def on_the_wire(trace: DroneTrace) -> DroneTrace:
-    """The same flight at poses that single precision holds."""
-    trace.positions_m[:], trace.rotations_deg[:] = (
-        np.round(trace.positions_m * 64) / 64,
-        np.round(trace.rotations_deg * 64) / 64,
-    )
-    return trace
-
-
 def flown(folder: Path, num_flights: int = 1, num_frames: int = 3) -> list[Path]:
-    return write_inputs(folder, [on_the_wire(circling(num_frames, f"path_{k:03d}")) for k in range(num_flights)])
+    """Inputs of flights at poses that single precision holds."""
+    traces = [circling(num_frames, f"path_{k:03d}") for k in range(num_flights)]
+    for values in (array for trace in traces for array in (trace.positions_m, trace.rotations_deg)):
+        values[:] = np.round(values * 64) / 64
+    return write_inputs(folder, traces)
 
 
 def config(port: int, settings: dict = CLEAN, **own) -> RenderConfig:

@@ -241,7 +241,7 @@ SIMULATORS = {"carla": (flown, carla_config), "unrealcv": (inputs, config)}
 @pytest.mark.slow
 @pytest.mark.parametrize(("protocol", "faults", "own"), [
     ("carla", ("drop:depth@5", "duplicate@7", "reorder:rgb@9", "delay:instance@11=7"), {"timeout_s": 6.0}),
-    ("unrealcv", ("drop:depth@2", "duplicate:lit@4", "malformed:object_mask@6", "malformed:depth@8", "delay:lit@10=4"),
+    ("unrealcv", ("drop:depth@2", "duplicate:lit@4", "malformed:object_mask@6", "malformed:depth@8", "delay:lit@9=4"),
         {"timeout_s": 3.0, "animate": False}),
 ])  # fmt: skip
 def test_lost_late_double_broken_and_disordered_pictures_change_nothing(protocol, faults, own, tmp_path):
