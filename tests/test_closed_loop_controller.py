@@ -108,21 +108,6 @@ def after(flight: ClosedLoopTrajectory, *commands) -> list:
     return moments
 
 
-def test_the_same_commands_give_the_same_flight_and_the_same_pictures_whatever_was_flown_beside_it(airspace, planned):
-    commands = [(1.2, 0.3, 0.1, 4.0), (2.0, 0, 0, -8.0), (0, 0, 0, 0)]
-    first = after(ClosedLoopTrajectory(airspace, planned), *commands)
-    other = ClosedLoopTrajectory(airspace, planned)
-    again = []
-    for moment in after(ClosedLoopTrajectory(airspace, planned), *commands):
-        again.append(moment)
-        other.reset()
-    for one, two in zip(first, again, strict=True):
-        assert np.array_equal(one.position_m, two.position_m)
-        assert np.array_equal(one.rotation_deg, two.rotation_deg)
-        assert np.array_equal(one.frame.rgb, two.frame.rgb)
-        assert one.target.model_dump() == two.target.model_dump()
-
-
 def test_a_held_command_is_reached_as_fast_as_the_drone_can_and_no_faster(airspace, planned):
     drone = Drone(accel_max_mps2=2.0, yaw_accel_max_degps2=20.0)
     flight = ClosedLoopTrajectory(airspace, planned, drone=drone)

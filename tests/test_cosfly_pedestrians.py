@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shapely import LineString, box
+from shapely import LineString, Polygon, box, contains_xy
 from specimens_planning import town_walks
 
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.bystanders import Bystander, Bystanders, read_bystanders, write_bystanders
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths
-from cosfly.formats.roi import Roi
 from cosfly.geometry.axes import DT_S
 from cosfly.maps.boxlist import BoxList
 from cosfly.pedestrians.astar import _line_cost
@@ -41,19 +40,6 @@ def town():
     extents = [[80, 80, 0.1], *np.column_stack([rng.uniform(1, 5, (40, 2)), np.full(40, 3.0)])]
     rotations = np.column_stack([np.zeros(41), [0.0, *rng.uniform(0, 360, 40)], np.zeros(41)])
     return make_box_map(centers, extents, rotations, [ROADS] + [BUILDINGS] * 40, header=MapHeader(name="Town"))
-
-
-def test_the_region_of_interest_bounds_every_walk():
-    roi = Roi(
-        points_world=[(10, 10), (150, 10), (150, 150), (10, 150)], holes=[[(60, 60), (100, 60), (100, 100), (60, 100)]]
-    )
-    ground = walkable_ground(town(), PedestriansConfig(), roi)
-    assert ground.counts["cells_in_roi"] == 280 * 280 - 80 * 80
-    walk = make_pedestrian("path_00000", ground, PedestriansConfig(), np.random.default_rng(0))
-    for xy in walk.trajectory.polyline_m:
-        assert (xy > 10).all()
-        assert (xy < 150).all()
-        assert not ((xy > 60) & (xy < 100)).all()
 
 
 @pytest.mark.parametrize(("ground", "columns"), [("anywhere", 300), ("surfaces", 240), ("paved", 160)])
@@ -163,7 +149,8 @@ def test_the_stage_writes_paths_report_and_picture(tmp_path):
     write_boxes(tmp_path / "step2_simplified.json", town())
     map_file = tmp_path / "step2_simplified.json"
     roi = tmp_path / "roi.json"
-    roi.write_text(json.dumps({"closed": True, "points_world": [[2, 2], [158, 2], [158, 140], [2, 140]]}))
+    corners, hole = [[2, 2], [158, 2], [158, 140], [2, 140]], [[60, 60], [100, 60], [100, 100], [60, 100]]
+    roi.write_text(json.dumps({"closed": True, "points_world": corners, "holes": [hole]}))
     product = run(PedestriansConfig(num_paths=3), map_file, tmp_path / "out", seed=7, roi=roi)
     paths = read_paths(product)
     assert [p.path_id for p in paths] == ["path_00000", "path_00001", "path_00002"]
@@ -172,7 +159,9 @@ def test_the_stage_writes_paths_report_and_picture(tmp_path):
     facts = json.loads((tmp_path / "out" / "pedestrians_report.json").read_text())
     assert facts["total"]["paths"] == len(facts["paths"]) == 3
     assert facts["total"]["points"] == sum(len(p.time_s) for p in paths)
-    assert facts["ground"]["cells_in_roi"] == 312 * 276
+    assert facts["ground"]["cells_in_roi"] == 312 * 276 - 80 * 80
+    region = Polygon(corners, [hole])
+    assert all(contains_xy(region, path.polyline_m).all() for path in paths)
     manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
     assert manifest["counts"] == {"input": 3, "kept": 3, "dropped": {}, "failed": {}}
     steps = {"read", "grid", "project", "inflate", "connectivity", "footing", "sample", "astar", "report"}

@@ -265,17 +265,11 @@ def test_a_whole_flight_along_a_planted_wall_keeps_the_planners_clearance(gap_m,
     assert (careless.poses.clearances_m.min() < 2.5) == (gap_m < 6.0), "or the wall would prove nothing"
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("render")
-    traces = [circling(5), circling(5, "path_001", "not_visible"), circling(4, "path_002")]
-    inputs = write_inputs(folder / "in", traces)
-    return run(build(RenderConfig, SMALL, "test"), *inputs, folder / "out", seed=5), inputs
-
-
-def test_the_tree_is_complete_and_readable_and_shows_what_its_annotation_says(finished, tmp_path):
+def test_the_tree_is_complete_and_readable_and_shows_what_its_annotation_says(tmp_path):
     """The inspection checks files, digests, masks, depths and boxes against poses."""
-    tree, (_, simplified, traces) = finished
+    flights = [circling(5), circling(5, "path_001", "not_visible"), circling(4, "path_002")]
+    boxes, simplified, traces = write_inputs(tmp_path / "in", flights)
+    tree = run(build(RenderConfig, SMALL, "test"), boxes, simplified, traces, tmp_path / "out", seed=5)
     assert len(read_public(tree)) == 2  # the strictest public reader
     folders = find_tracks(tree)
     names = [str(f.relative_to(tree)) for f in folders]

@@ -48,6 +48,7 @@ def foreign(tmp_path_factory) -> Path:
     return write_foreign_tree(tmp_path_factory.mktemp("foreign"))
 
 
+TRAJECTORY = "Town01/trajectory_1777083733"
 KEPT = CaptionConfig.model_validate({"repair": {"hard_conflict": "keep"}})  # every window has a caption
 
 
@@ -103,27 +104,16 @@ def holds(found: object, wanted: object) -> bool:
     return found == pytest.approx(wanted) if isinstance(wanted, float) else found == wanted
 
 
-def test_a_quirk_is_read_and_survives_writing(foreign, tmp_path, subtests):
-    for variant in ("ORI", "aug_001"):
-        folder = tmp_path / "Town01/trajectory_1777083733" / variant
-        folder.mkdir(parents=True)
-    for name, change in QUIRKS.items():
-        for folder in sorted((tmp_path / "Town01/trajectory_1777083733").iterdir()):
-            with subtests.test(name):
-                shutil.copy(foreign / folder.relative_to(tmp_path) / "trajectory.json", folder)
-                _check_quirk(folder, name, change)
-
-
 def test_false_is_no_place(foreign, tmp_path):
     """Public files write false for an offset that is zero; a target's place is unknown then, not the origin."""
-    folder = tmp_path / "Town01/trajectory_1777083733/ORI"
-    shutil.copytree(foreign / folder.relative_to(tmp_path), folder)
-    change_json(folder / "trajectory.json", each(lambda p: p.update(target={"world_location": False, "depth": 3.0})))
-    assert np.isnan(read_track(folder).targets_m).all()
+    change = each(lambda p: p.update(target={"world_location": False, "depth": 3.0}))
+    assert np.isnan(read_track(rewrite(foreign / TRAJECTORY / "ORI", tmp_path, change)).targets_m).all()
 
 
-def _check_quirk(folder: Path, name: str, change: Callable[[dict], object]) -> None:
-    change_json(folder / "trajectory.json", change)
+@pytest.mark.parametrize("variant", ["ORI", "aug_001"])
+@pytest.mark.parametrize("name", QUIRKS)
+def test_a_quirk_is_read_and_survives_writing(foreign, tmp_path, name, variant):
+    folder = rewrite(foreign / TRAJECTORY / variant, tmp_path, QUIRKS[name])
     flight = read_track(folder)
     assert bool(flight.issues) == (name in TOLERATED)
     assert len(flight) == 16
@@ -161,7 +151,7 @@ def test_nobody_is_no_target(foreign):
 
 def test_the_clean_twin_is_the_track_beside_it(foreign, tmp_path):
     tree = shutil.copytree(foreign, tmp_path / "tree", copy_function=os.link)
-    clean, shaken = (read_track(tree / "Town01/trajectory_1777083733" / variant) for variant in ("ORI", "aug_001"))
+    clean, shaken = (read_track(tree / TRAJECTORY / variant) for variant in ("ORI", "aug_001"))
     twin = read_twin(shaken)
     assert twin is not None
     assert_array_equal(twin.positions_m, clean.positions_m)
