@@ -27,7 +27,7 @@ bench.FITTED_ON = 200
     ("bench_client", "--windows 40 --concurrency 8", r"encoded before .* requests/s"),
     ("bench_flying", "", r"2 side by side: .* steps a second",
              "bench.NUM_DECISIONS = 4"),
-    ("bench_planning", "--maps a --planners track_astar muco", r"muco \| \d+ \| 1 of 1",
+    ("bench_planning", "--planners track_astar muco", r"muco \| \d+ \| 1 of 1",
              SMALL_TOWN + "scenes.NUM_WALKS, bench.WALKS = 1, bench.WALKS.model_copy(update={'num_paths': 1})"),
     ("bench_release", "8 --rounds 1", r"build: \d+ % of the speed of the copy",
              "bench.NUM_POINTS, bench.NUM_POOL, bench.FRAMES_RELEASED, bench.SIZE_PX = 8, 1, 4, (160, 90)"),

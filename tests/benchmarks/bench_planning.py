@@ -1,13 +1,11 @@
 """Steps 2 to 4: times of simplification, pedestrian trajectories and planners.
 
-python tests/benchmarks/bench_planning.py [--maps a b] [--planners muco ...]
+python tests/benchmarks/bench_planning.py [--planners muco ...]
 """
 
 import argparse
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scenes
@@ -68,63 +66,38 @@ def ground_stages() -> None:
     walking(simple)
 
 
-@dataclass(frozen=True)
-class Scene:
-    name: str
-    obstacles: BoxIndex
-    scenarios: list[Scenario]
-
-
-def make_scene(name: str, box_map: BoxMap, **settings: Any) -> Scene:
-    obstacles = obstacle_index(box_map)
-    walks = scenes.walks_on(box_map, **settings)
-    return Scene(name, obstacles, [make_scenario(walk, obstacles, PlanConfig()) for walk in walks])
-
-
-def make_scenes(wanted: list[str]) -> list[Scene]:
-    found = []
-    if "a" in wanted:
-        found.append(make_scene("(a) town", scenes.simplified(scenes.town())))
-    city = scenes.city() if "b" in wanted else None
-    if city is not None:
-        found.append(make_scene("(b) city", scenes.simplified(city), ground="paved"))
-    return found
-
-
-def measure(scene: Scene, planner: str, cfg: PlanConfig) -> list:
+def measure(planner: str, scenarios: list[Scenario], obstacles: BoxIndex, cfg: PlanConfig) -> list:
     plan = load_planner(planner)
     times, num_points = [], []
-    for scenario in scene.scenarios:
+    for scenario in scenarios:
         try:
             ms, made = scenes.cpu_ms(
-                lambda s=scenario: plan(s, scene.obstacles, cfg, rng_for(scenes.SEED, "plan", s.path_id))
+                lambda s=scenario: plan(s, obstacles, cfg, rng_for(scenes.SEED, "plan", s.path_id))
             )
         except NoPathError:
             continue
         times.append(ms)
         num_points.append(len(made.positions_m))
-    return [
-        scene.name, planner, len(scene.obstacles.rows), f"{len(times)} of {len(scene.scenarios)}",
-        round(np.mean(num_points)), float(np.mean(times)), float(np.percentile(times, 95)), max(times),
-    ]  # fmt: skip
+    flown = f"{len(times)} of {len(scenarios)}"
+    return [planner, len(obstacles.rows), flown, round(np.mean(num_points)), float(np.mean(times))]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--maps", nargs="+", default=["a", "b"], choices=["a", "b"])
     parser.add_argument("--planners", nargs="+", default=list(PLANNERS), choices=list(PLANNERS))
     options = parser.parse_args()
     scenes.one_thread_and_machine()
     ground_stages()
-    cfg, found, rows = PlanConfig(), make_scenes(options.maps), []
+    cfg, town, rows = PlanConfig(), scenes.simplified(scenes.town()), []
+    obstacles = obstacle_index(town)
+    scenarios = [make_scenario(walk, obstacles, cfg) for walk in scenes.walks_on(town)]
     for planner in options.planners:
-        first = Scene("warm-up", found[0].obstacles, found[0].scenarios[:2])
-        warm_up_ms, _ = scenes.cpu_ms(lambda p=planner, s=first: measure(s, p, cfg))
+        warm_up_ms, _ = scenes.cpu_ms(lambda p=planner: measure(p, scenarios[:2], obstacles, cfg))
         print(f"{planner}: first two flights with compilation or its cache {warm_up_ms / 1e3:.2f} s")
-        rows += [measure(scene, planner, cfg) for scene in found]
+        rows.append(measure(planner, scenarios, obstacles, cfg))
     print()
-    names = ["map", "planner", "obstacles", "trajectories", "points", "mean ms", "p95 ms", "max ms"]
-    scenes.print_table("planning, start included", names, rows)
+    names = ["planner", "obstacles", "trajectories", "points", "mean ms"]
+    scenes.print_table("planning, start included, map (a)", names, rows)
 
 
 if __name__ == "__main__":

@@ -62,9 +62,9 @@ def simplified(raw: BoxMap) -> BoxMap:
     return simplify(raw, SimplifyConfig())
 
 
-def walks_on(box_map: BoxMap, **settings: Any) -> list[PedestrianTrajectory]:
-    """20 walks (`num_paths`) of 75 to 100 m as the crow flies: about 186 points, the length of the paper's pilot."""
-    cfg = PedestriansConfig(**{"num_paths": NUM_WALKS, "min_distance_m": 75.0, **settings})
+def walks_on(box_map: BoxMap) -> list[PedestrianTrajectory]:
+    """20 walks of 75 to 100 m as the crow flies: about 186 points, the length of the paper's pilot."""
+    cfg = PedestriansConfig(num_paths=NUM_WALKS, min_distance_m=75.0)
     ground = walkable_ground(box_map, cfg)
     names = [f"path_{k:05d}" for k in range(cfg.num_paths)]
     return [make_pedestrian(name, ground, cfg, rng_for(SEED, "pedestrians", name)).trajectory for name in names]
