@@ -105,26 +105,15 @@ def test_look_alikes_differ_from_the_target_in_one_thing_and_nobody_looks_just_l
     assert different[1::2].max() > 1
 
 
-def blank_frame(depth: np.ndarray) -> Frame:
-    return Frame(
-        np.zeros((*depth.shape, 3), np.uint8), depth.astype(np.float32), np.zeros(depth.shape, np.uint8),
-        np.zeros(depth.shape, np.uint16),
-    )  # fmt: skip
-
-
-def test_rendered_visibility_by_hand():
+def test_half_a_person_is_seen_behind_a_corner_and_nobody_hides_himself():
     hip = np.array([0.0, 10.0, 0.9])
-    pose = pose_towards((0, 0, 0.9), hip)
+    pose, ids = pose_towards((0, 0, 0.9), hip), np.zeros((180, 320), np.uint16)
     view = view_target(hip, pose, CAMERA)
-    free = np.full((180, 320), 500.0)
-    assert rendered_visibility(blank_frame(free), hip, view, pose, CAMERA)[0] == 1.0
-    assert rendered_visibility(blank_frame(np.full((180, 320), 5.0)), hip, view, pose, CAMERA)[0] == 0.0
-    half = free.copy()
-    half[:, :160] = 5.0
-    assert rendered_visibility(blank_frame(half), hip, view, pose, CAMERA)[0] == pytest.approx(0.5, abs=0.03)
-    drawn = blank_frame(half)
-    drawn.ids[:, :160] = PERSON_ID
-    assert rendered_visibility(drawn, hip, view, pose, CAMERA) == (1.0, 0.0, 0.0), "it does not hide itself"
+    depth = np.where(np.arange(320) < 160, np.float32(5.0), np.float32(500.0)) + np.zeros((180, 1), np.float32)
+    frame = Frame(np.zeros((180, 320, 3), np.uint8), depth, ids.astype(np.uint8), ids)
+    assert rendered_visibility(frame, hip, view, pose, CAMERA)[0] == pytest.approx(0.5, abs=0.03)
+    frame.ids[:, :160] = PERSON_ID
+    assert rendered_visibility(frame, hip, view, pose, CAMERA) == (1.0, 0.0, 0.0)
 
 
 def planned(n: int = 200, box_map=None) -> Poses:
