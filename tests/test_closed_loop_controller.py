@@ -24,9 +24,6 @@ from cosfly.planners.stage import plan_trajectory
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.json_io import write_model
 
-CONTROLS = read_controls()
-HORIZON = 5  # decisions, 2.5 s, as labels look ahead
-
 
 @pytest.fixture(scope="module")
 def begin():
@@ -38,13 +35,13 @@ def begin():
     def start(num_lead=40):
         flight = ClosedLoopTrajectory(airspace, plan, num_lead=num_lead)
         moment = flight.reset()[-1]
-        return flight, Controller(CONTROLS, Drone(), moment), moment
+        return flight, Controller(read_controls(), Drone(), moment), moment
 
     yield start
     airspace.renderer.close()
 
 
-def flown(begin, *tokens) -> tuple[list, Motion, Controller]:
+def flown(begin, *tokens) -> Motion:
     flight, controller, moment = begin()
     before_mps = float(np.linalg.norm(moment.velocity_mps))
     moments = [moment]
@@ -58,13 +55,13 @@ def flown(begin, *tokens) -> tuple[list, Motion, Controller]:
         np.array([m.target.visible for m in moments]),
         before_mps,
     )
-    return moments, measure(future), controller
+    return measure(future)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("token", [t for t in TOKENS if t != "search_to_reacquire_target"])
 def test_a_decision_that_is_flown_for_its_horizon_shows_what_its_own_rule_asks_for(begin, token):
-    _, motion, _ = flown(begin, *[token] * HORIZON)
+    motion = flown(begin, *[token] * 5)  # 2.5 s, as labels look ahead
     if token in ("break_off", "return_to_home"):  # orders of a mission; who leaves without one leaves the person
         assert motion.approach_m <= -Thresholds().approach_m
         return

@@ -331,16 +331,6 @@ def test_perturbed_twins_are_one_walk_once_they_are_read_again(tmp_path):
     assert groups(one, replace(other, target_m=read[1].targets_m)) == [{"ORI"}, {"aug_001"}]  # the shift was real
 
 
-def test_another_timestamp_planner_or_run_is_the_same_walk():
-    points = walk(60)
-    noise = np.random.default_rng(1).normal(0, 0.01, points[1].shape)
-    assert groups(
-        course("a/Town01/trajectory_1", points),
-        course("a/Town01/trajectory_2", points),
-        course("b/Town01/trajectory_1", (points[0], points[1] + noise)),
-    ) == [{"a/Town01/trajectory_1", "a/Town01/trajectory_2", "b/Town01/trajectory_1"}]
-
-
 @pytest.mark.parametrize(("num_s", "near_s", "beside_m", "is_one"), [
     (20, 20, 0.49, True), (20, 20, 0.51, False), (20, 10, 0.4, True), (20, 9, 0.4, False), (8, 5, 0.4, True),
     (8, 4, 0.4, False), (3, 3, 0.4, True),

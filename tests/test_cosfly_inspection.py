@@ -211,11 +211,6 @@ def flip_byte(path: Path, position: int) -> None:
     path.write_bytes(data)
 
 
-def without_person(image: np.ndarray) -> np.ndarray:
-    image[image[..., 2] == 12] = 0
-    return image
-
-
 def edit(folder: Path, change) -> None:
     change_json(folder / "trajectory.json", change)
 
@@ -249,7 +244,9 @@ DEFECTS = {
     "mask_disagrees small": lambda f: record_masks(f, {3: [1.0, 1.0, 3.0, 3.0]}),
     "mask_disagrees large": lambda f: record_masks(f, {3: [0.0, 0.0, 192.0, 108.0]}),
     "mask_disagrees null": lambda f: record_masks(f, {3: None}),
-    "mask_disagrees": lambda f: edit_image(f / FRAME / "instance.png", without_person),
+    "mask_disagrees": lambda f: edit_image(
+        f / FRAME / "instance.png", lambda image: np.where(image[..., 2:] == KINDS["Pedestrians"], 0, image)
+    ),
     "blank_frame": lambda f: edit_image(f / FRAME / "rgb.png", lambda image: image * 0 + 90),
     "frozen_frame": lambda f: shutil.copy(f / frame_name(2) / "rgb.png", f / FRAME / "rgb.png"),
     "pose_differs": lambda f: edit(f, at_point("drone_pose", "yaw", 12.0)),

@@ -295,9 +295,6 @@ def test_the_stage_writes_others_only_where_they_are_wanted(tmp_path: Path, capl
     assert counts == {"wanted": 9, "placed": sum(len(bystanders.others) for bystanders in companions)}
 
 
-KERB_CFG = PedestriansConfig(road_cost=20, min_component_cells=100, min_distance_m=20)
-
-
 def street(*, marked: bool = False, reach_m: float = 40.0) -> BoxList:
     """Two streets of 8 m that cross at the origin, between pavements of 4 m, on a lawn; one has dashes."""
     boxes, middle_m, length_m = BoxList(), (reach_m + 4) / 2, reach_m - 4
@@ -330,7 +327,8 @@ def test_points_are_counted_by_where_they_are():
         walk = PedestrianTrajectory(
             "p", places, np.arange(len(places)) * 0.5, np.pad(places, ((0, 0), (0, 1))), np.ones(len(places))
         )
-        ground = walkable_ground(street(marked=marked).box_map(), KERB_CFG)
+        cfg = PedestriansConfig(road_cost=20, min_component_cells=100)
+        ground = walkable_ground(street(marked=marked).box_map(), cfg)
         assert count_on_road(walk, ground.footing, ground.grid) == counts
 
 

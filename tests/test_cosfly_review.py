@@ -115,9 +115,6 @@ def flight_of(walked_m, **changes):
     return replace(flight, targets_m=targets, positions_m=positions, perturbation=still, is_original=True, **changes)
 
 
-EVEN = np.column_stack([0.6 * np.arange(1, NUM + 1), np.zeros(NUM)])
-
-
 @given(st.integers(0, 2**31))
 @settings(max_examples=25, deadline=None)
 def test_a_past_is_the_same_wherever_and_whenever_it_was(seed):
@@ -140,7 +137,7 @@ def test_a_past_is_the_same_wherever_and_whenever_it_was(seed):
 
 def test_a_past_holds_what_a_prompt_may_tell():
     """Poses as they were drawn, with their perturbation, and no place of a target that nobody sees."""
-    clean = flight_of(EVEN)
+    clean = flight_of(np.column_stack([0.6 * np.arange(1, NUM + 1), np.zeros(NUM)]))
     shifted_m = np.zeros((NUM, 3))
     shifted_m[3] = 0.5, -0.5, 0.2
     noisy = replace(

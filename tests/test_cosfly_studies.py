@@ -78,11 +78,11 @@ EVENTS = [
     event(20, "item_done", worker=0, item="c", status="dropped", seconds=5.0, steps=10),
     event(20, "ended"),
 ]
-MANIFEST = Manifest(stage="render", outputs=[], counts=Tally(input=3, kept=2, dropped={"far": 1}), seconds=20.0)
 
 
 def test_figures_of_a_run():
-    assert rendering_figures(EVENTS, MANIFEST) == {"2 workers": [20.0, 120, 80, 4.0, 1.0, 1.5, 220.0, 1, 0]}
+    manifest = Manifest(stage="render", outputs=[], counts=Tally(input=3, kept=2, dropped={"far": 1}), seconds=20.0)
+    assert rendering_figures(EVENTS, manifest) == {"2 workers": [20.0, 120, 80, 4.0, 1.0, 1.5, 220.0, 1, 0]}
 
 
 def test_what_lost_workers_had_done_is_counted(tmp_path):
