@@ -268,75 +268,54 @@ RAINY_NIGHT = WeatherParams(
 
 
 def _drawn(port: int) -> tuple:
-    """By CARLA and by the embedded renderer a walker in step 0, nobody at a rainy night, and nobody by day; by CARLA
-    the walker also through a longer lens; and the weather that the server was told."""
-    import carla
-
-    frames, near, told = [], None, None
-    clothes, found = clothes_of("walker.pedestrian.0001"), street()
-    pose, lens = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-32.5, 60.0, 0.0])), intrinsic_matrix
-    person = PosedPerson(np.array([4.0, -3.0, 0.90625]), 0.0, 0.0, 1.0, clothes)
-    for own in ({"settings": build(CarlaRenderConfig, {"port": port, **QUICK}, "test")}, {}):
-        renderer = open_renderer("carla" if own else "gl", found, 160, 90, **own)
-        frames.append([renderer.render(pose, lens(160, 90, 60.0), {PERSON_ID: person})])
-        if own:
-            near = renderer.render(pose, lens(160, 90, 30.0), {PERSON_ID: person})  # other cameras
-            with pytest.raises(RenderError, match=r"cannot render with this intrinsic matrix.*square pixels"):
-                renderer.render(pose, lens(160, 90, 60.0) + np.eye(3)[0], {})
-        for weather in (RAINY_NIGHT, None):
-            renderer.prepare(*found.bounds(), weather)
-            frames[-1].append(renderer.render(pose, lens(160, 90, 60.0), {}))
-            if own and weather:
-                told = carla.Client("127.0.0.1", port).get_world().get_weather()
-        renderer.close()
-    return *frames, near, {name: getattr(told, name) for name in RAINY_NIGHT.model_dump()}
-
-
-def test_a_person_zoom_and_weather_are_those_of_the_embedded_renderer(tmp_path):
-    with serving(street(), tmp_path) as port:
-        (ours, rainy, fair), (theirs, their_rainy, their_fair), near, told = as_client(_drawn, port)
-        assert as_client(carla_settings, port) == AS_FOUND
-    masks = [frame.ids == PERSON_ID for frame in (ours, theirs)]
-    assert masks[0].sum() > 30
-    assert np.argwhere(masks[0]).mean(axis=0) == pytest.approx(np.argwhere(masks[1]).mean(axis=0), abs=1.5)
-    assert (near.ids == PERSON_ID).sum() > 2.5 * masks[0].sum()
-    assert (ours.ids != theirs.ids)[~masks[0] & ~masks[1]].sum() == 0
-    assert told == RAINY_NIGHT.model_dump()
-    rainy, fair, their_rainy, their_fair = (one.rgb.astype(float) for one in (rainy, fair, their_rainy, their_fair))
-    assert fair.mean() > rainy.mean() + 30.0
-    assert np.abs(rainy - their_rainy).mean() < 2.0
-    assert np.abs(fair - their_fair).mean() < 2.0
-
-
-def _after_another_client(port: int) -> tuple:
-    """Fair weather after a client that set CARLA's default weather; the spectator meanwhile and at the end."""
+    """After another client, by CARLA and by the embedded renderer: a walker in step 0, and nobody by day, at a rainy
+    night and by day; by CARLA the walker also through a longer lens; the weather that the server was told; places of
+    the spectator meanwhile and at the end, and the weather then."""
     import carla
 
     world = carla.Client("127.0.0.1", port).get_world()
     world.set_weather(carla.WeatherParameters())  # fog from 0 m, and the sun on the horizon
     world.get_spectator().set_transform(carla.Transform(carla.Location(1.0, 2.0, 3.0), carla.Rotation(0.0, 90.0, 0.0)))
     world.wait_for_tick()
-    settings = build(CarlaRenderConfig, {"port": port, **QUICK}, "test")
-    renderer = open_renderer("carla", street(), 160, 90, settings=settings)
-    renderer.prepare(*street().bounds(), None)
-    pose = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-32.5, 60.0, 0.0]))
-    fair = renderer.render(pose, intrinsic_matrix(160, 90, 60.0), {})
-    renderer.render(pose, intrinsic_matrix(160, 90, 60.0), {})  # a client knows a place one tick later
-    places = [renderer._spectator.get_transform().location]
-    renderer.close()
+    frames, near, told, places = [], None, None, []
+    clothes, found = clothes_of("walker.pedestrian.0001"), street()
+    pose, lens = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-32.5, 60.0, 0.0])), intrinsic_matrix
+    person = PosedPerson(np.array([4.0, -3.0, 0.90625]), 0.0, 0.0, 1.0, clothes)
+    for own in ({"settings": build(CarlaRenderConfig, {"port": port, **QUICK}, "test")}, {}):
+        renderer = open_renderer("carla" if own else "gl", found, 160, 90, **own)
+        frames.append([renderer.render(pose, lens(160, 90, 60.0), {PERSON_ID: person})])
+        for weather in (None, RAINY_NIGHT, None):
+            renderer.prepare(*found.bounds(), weather)
+            frames[-1].append(renderer.render(pose, lens(160, 90, 60.0), {}))
+            if own and weather:
+                told = world.get_weather()
+        if own:
+            near = renderer.render(pose, lens(160, 90, 30.0), {PERSON_ID: person})  # other cameras
+            with pytest.raises(RenderError, match=r"cannot render with this intrinsic matrix.*square pixels"):
+                renderer.render(pose, lens(160, 90, 60.0) + np.eye(3)[0], {})
+            places.append(renderer._spectator.get_transform().location)
+        renderer.close()
     world.wait_for_tick()
     places.append(world.get_spectator().get_transform().location)
     left = world.get_weather()
-    return fair.rgb.mean(), [(one.x, one.y, one.z) for one in places], (left.fog_distance, left.sun_altitude_angle)
+    told = {name: getattr(told, name) for name in RAINY_NIGHT.model_dump()}
+    return *frames, near, told, [(one.x, one.y, one.z) for one in places], (left.fog_distance, left.sun_altitude_angle)
 
 
-def test_what_another_client_left_neither_stops_nor_changes_pictures(tmp_path):
+def test_a_person_zoom_and_weather_are_those_of_the_embedded_renderer_whatever_another_client_left(tmp_path):
     with serving(street(), tmp_path) as port:
-        mean, (camera_m, left_m), weather = as_client(_after_another_client, port)
-    gl = open_renderer("gl", street(), 160, 90)
-    pose = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-32.5, 60.0, 0.0]))
-    assert mean == pytest.approx(gl.render(pose, intrinsic_matrix(160, 90, 60.0), {}).rgb.mean(), abs=3.0)
-    gl.close()
+        (ours, *pictures), (theirs, *their_pictures), near, told, (camera_m, left_m), weather = as_client(_drawn, port)
+        assert as_client(carla_settings, port) == (False, 0, 0.0)
+    masks = [frame.ids == PERSON_ID for frame in (ours, theirs)]
+    assert masks[0].sum() > 30
+    assert np.argwhere(masks[0]).mean(axis=0) == pytest.approx(np.argwhere(masks[1]).mean(axis=0), abs=1.5)
+    assert (near.ids == PERSON_ID).sum() > 2.5 * masks[0].sum()
+    assert (ours.ids != theirs.ids)[~masks[0] & ~masks[1]].sum() == 0
+    assert told == RAINY_NIGHT.model_dump()
+    fair, rainy, _ = (one.rgb.astype(float) for one in pictures)
+    assert fair.mean() > rainy.mean() + 30.0
+    for own, other in zip(pictures, their_pictures, strict=True):
+        assert np.abs(own.rgb.astype(float) - other.rgb).mean() < 2.0
     assert camera_m == pytest.approx((-1.0, 9.5, 5.5))
     assert left_m == pytest.approx((1.0, 2.0, 3.0))
     assert weather == (0.0, 0.0)
