@@ -170,23 +170,16 @@ def _follow(targets: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, 
 def _scene(targets: np.ndarray, positions: np.ndarray, rng: np.random.Generator) -> Scene:
     """A few buildings beside the walk and one wall that hides the person for some frames in the middle of the
     flight."""
-    centers, halves, colors, kinds = [], [], [], []
+    rows, middle, k = [], targets[len(targets) // 2], int(0.6 * len(targets))
     for _ in range(6):
         angle, distance_m = rng.uniform(-np.pi, np.pi), rng.uniform(25.0, 45.0)
-        half = np.array([rng.uniform(3.0, 7.0), rng.uniform(3.0, 7.0), rng.uniform(3.0, 9.0)])
-        middle = targets[len(targets) // 2]
-        centers.append([middle[0] + distance_m * np.cos(angle), middle[1] + distance_m * np.sin(angle), half[2]])
-        halves.append(half)
-        colors.append(rng.integers(90, 200, 3))
-        kinds.append(KINDS["Buildings"])
-    k = int(0.6 * len(targets))
+        half = [rng.uniform(3.0, 7.0), rng.uniform(3.0, 7.0), rng.uniform(3.0, 9.0)]
+        center = [middle[0] + distance_m * np.cos(angle), middle[1] + distance_m * np.sin(angle), half[2]]
+        rows.append((center, half, rng.integers(90, 200, 3), KINDS["Buildings"]))
     between = targets[k, :2] + 0.12 * (positions[k, :2] - targets[k, :2])
-    centers.append([*between, 1.5])
-    halves.append(np.array([0.6, 0.6, 1.5]))
-    colors.append(np.array([120, 110, 100]))
-    kinds.append(KINDS["Walls"])
-    ids = np.arange(1, len(centers) + 1)
-    return Scene(np.array(centers), np.array(halves), np.array(colors, np.uint8), np.array(kinds), ids)
+    rows.append(([*between, 1.5], [0.6, 0.6, 1.5], np.array([120, 110, 100]), KINDS["Walls"]))
+    centers, halves, colors, kinds = map(np.array, zip(*rows, strict=True))
+    return Scene(centers, halves, colors.astype(np.uint8), kinds, np.arange(1, len(rows) + 1))
 
 
 def _visible_share(scene: Scene, target: np.ndarray, position: np.ndarray) -> float:

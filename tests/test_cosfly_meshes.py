@@ -49,18 +49,13 @@ def sorted_rows(corners: np.ndarray) -> np.ndarray:
     return turned[np.lexsort(turned.reshape(len(turned), -1).T[::-1])]
 
 
-def two_things() -> trimesh.Scene:
+def test_nodes_of_gltf_stand_where_they_were_put(tmp_path: Path) -> None:
     """A turned, stretched ball below a node that is itself moved, and a mirrored box."""
-    scene = trimesh.Scene()
+    path, theirs = tmp_path / "things.glb", trimesh.Scene()
     turn = trimesh.transformations.rotation_matrix(0.7, (1, 2, 3), (0.5, 0, 0))
     ball, box = trimesh.creation.icosphere(subdivisions=1), trimesh.creation.box((1.0, 2.0, 3.0))
-    scene.add_geometry(ball, node_name="ball", transform=turn @ np.diag([1.0, 2.0, 0.5, 1.0]))
-    scene.add_geometry(box, node_name="box", transform=np.diag([-1.0, 1.0, 1.0, 1.0]))
-    return scene
-
-
-def test_nodes_of_gltf_stand_where_they_were_put(tmp_path: Path) -> None:
-    path, theirs = tmp_path / "things.glb", two_things()
+    theirs.add_geometry(ball, node_name="ball", transform=turn @ np.diag([1.0, 2.0, 0.5, 1.0]))
+    theirs.add_geometry(box, node_name="box", transform=np.diag([-1.0, 1.0, 1.0, 1.0]))
     theirs.export(path)
     found = read_meshes(path, tree=tmp_path)
     assert set(found) == {"ball", "box"}

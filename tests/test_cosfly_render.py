@@ -131,10 +131,11 @@ def shaken(before: Poses, box_map: BoxMap, cfg: PerturbationConfig, seed: int = 
     return perturb(before, cameras, Surroundings(box_map), cfg, np.random.default_rng(seed))
 
 
+@pytest.mark.parametrize(("correlation_s", "num"), [(0.0, 200), (6.0, 4000)])
 @pytest.mark.parametrize("sampling", ["cubic", "spherical"])
-def test_perturbed_frames_keep_their_promises(sampling):
-    cfg = PerturbationConfig(sampling=sampling)
-    before, after = planned(), perturbed(cfg)
+def test_perturbed_frames_keep_their_promises(sampling, correlation_s, num):
+    cfg = PerturbationConfig(sampling=sampling, correlation_s=correlation_s)
+    before, after = planned(num), perturbed(cfg, num)
     index = obstacle_index(street())
     moved = np.array([s["position"] == "applied" for s in after.states])
     turned = np.array([s["rotation"] == "applied" for s in after.states])
@@ -147,7 +148,7 @@ def test_perturbed_frames_keep_their_promises(sampling):
     people, _ = signed_distances(index, after.poses.targets_m[moved])
     assert people.min() >= 0.3
     assert np.abs(after.rotation_offsets_deg).max() <= cfg.max_view_deg + 1e-9
-    rolled = perturbed(PerturbationConfig(sampling=sampling, max_roll_deg=4.0))
+    rolled = perturbed(cfg.model_copy(update={"max_roll_deg": 4.0}), num)
     np.testing.assert_array_equal(rolled.rotation_offsets_deg[:, :2], after.rotation_offsets_deg[:, :2])
     np.testing.assert_array_equal(rolled.poses.rotations_deg[:, 2], rolled.rotation_offsets_deg[:, 2])
     assert not after.rotation_offsets_deg[:, 2].any()
@@ -168,16 +169,11 @@ def test_perturbed_frames_keep_their_promises(sampling):
 
 
 @pytest.mark.parametrize("sampling", ["cubic", "spherical"])
-def test_smooth_perturbations_keep_probabilities_and_radii_and_move_as_a_drone_and_a_walker_could(sampling):
-    cfg = PerturbationConfig(sampling=sampling, correlation_s=6.0, max_roll_deg=4.0)
-    n, dt_s = 4000, 0.5
-    before, after = planned(n), perturbed(cfg, n)
+def test_smooth_perturbations_keep_probabilities_and_move_as_a_drone_and_a_walker_could(sampling):
+    cfg, dt_s = PerturbationConfig(sampling=sampling, correlation_s=6.0), 0.5
+    after = perturbed(cfg, 4000)
     drawn = np.array([[state["position"] != "none", state["rotation"] != "none"] for state in after.states])
     np.testing.assert_allclose(drawn.mean(axis=0), [0.6, 0.6], atol=0.1)
-    applied = np.array([state["position"] == "applied" for state in after.states])
-    assert applied.mean() > 0.3
-    assert not after.drone_offsets_m[~applied].any()
-    assert not after.target_offsets_m[~applied].any()
     order = None if sampling == "spherical" else np.inf
     for offsets_m, radius_m in (
         (after.drone_offsets_m, cfg.drone_radius_m), (after.target_offsets_m[:, :2], cfg.pedestrian_radius_m)
@@ -188,9 +184,6 @@ def test_smooth_perturbations_keep_probabilities_and_radii_and_move_as_a_drone_a
         accelerations_mps2 = np.linalg.norm(np.diff(steps, axis=0), axis=1) / dt_s**2
         assert speeds_mps.max() < 2.5
         assert np.percentile(accelerations_mps2, 95) < 1.5
-    assert 2.0 < np.abs(after.rotation_offsets_deg[:, 2]).max() <= 4.0
-    assert np.abs(after.rotation_offsets_deg).max() <= cfg.max_view_deg
-    np.testing.assert_allclose(after.poses.positions_m - before.positions_m, after.drone_offsets_m)
 
 
 def test_a_smooth_perturbation_fades_before_it_falls_back():

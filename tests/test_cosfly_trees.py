@@ -185,19 +185,6 @@ def test_a_foreign_tree_passes_the_inspection_without_plans(way):
     assert {flight.track for flight in found.flights if flight.variant == "aug_001"} == {"perturbed"}
 
 
-def test_a_foreign_tree_is_captioned_with_the_labels_of_its_clean_twins(way):
-    found = list(read_captions(way / "caption/captions.jsonl"))
-    assert len(found) == 4 * 4  # of 13 points
-    assert {caption.drop_reason for caption in found} <= {None, "no_reason"}
-    labels = {(c.town, c.trajectory, c.variant, c.frame_index): c.label for c in found}
-    shaken = [caption for caption in found if caption.variant == "aug_001"]
-    assert {caption.label_from for caption in shaken} == {"twin"}
-    for caption in shaken:
-        assert caption.label == labels[caption.town, caption.trajectory, "ORI", caption.frame_index]
-    assert len({caption.sample_id for caption in found}) == len(found)
-    assert {caption.sample_id.partition("_trajectory")[0] for caption in found} == {"Town01", "Town10HD_Opt"}
-
-
 def test_a_foreign_tree_gives_samples_and_a_release(way):
     num_kept = sum(caption.status == "accepted" for caption in read_captions(way / "caption/captions.jsonl"))
     assert num_kept >= 8

@@ -67,16 +67,6 @@ def test_a_served_town_comes_back_as_it_is(tmp_path):
     assert counts == town.counts()
 
 
-def test_a_server_that_is_not_there_or_is_silent_is_named(tmp_path):
-    port = free_port()
-    with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port}.*no CARLA server.*refused"):
-        carla_export.load(CarlaMapConfig(port=port), 0)
-    with serving(street(), tmp_path, "hang@0") as port:
-        cfg = CarlaMapConfig(port=port, timeout_s=1.0)
-        with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port}.*no CARLA server.*time-out of 1000ms"):
-            carla_export.load(cfg, 0)
-
-
 def test_a_server_that_names_a_file_outside_the_cache_is_refused(tmp_path):
     words = r"names a file outside the client's cache; got \.\./\.\./escaped"
     with serving(street(), tmp_path, "escape@0+") as port, pytest.raises(EnvironmentMissing, match=words):

@@ -22,7 +22,8 @@ from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
-from cosfly.maps import unrealcv_export
+from cosfly.maps import carla_export, unrealcv_export
+from cosfly.maps.carla_export import CarlaMapConfig
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig, level_map
@@ -89,12 +90,22 @@ def test_a_served_town_comes_back_as_it_is(tmp_path):
     assert {"boxes_meta.json", "boxes.html"} <= {one["path"] for one in manifest["outputs"]}
 
 
-def test_a_server_that_is_not_there_silent_old_or_another_is_named(monkeypatch):
+@pytest.mark.parametrize(("protocol", "load", "config", "silent"), [
+    ("carla", carla_export.load, CarlaMapConfig, "no CARLA server.*time-out of 1000ms"),
+    ("unrealcv", unrealcv_export.load, UnrealCvMapConfig, "no answer in 1 s"),
+])  # fmt: skip
+def test_a_server_that_is_not_there_or_is_silent_is_named(protocol, load, config, silent, tmp_path):
     port = free_port()
-    with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port} \(UnrealCV unknown\): no UnrealCV.*refused"):
-        unrealcv_export.load(UnrealCvMapConfig(port=port), 0)
-    with beside(street(), "hang@0") as port, pytest.raises(EnvironmentMissing, match=rf":{port}.*no answer in 1 s"):
-        unrealcv_export.load(UnrealCvMapConfig(port=port, timeout_s=1.0), 0)
+    with pytest.raises(EnvironmentMissing, match=rf"(?i)127\.0\.0\.1:{port}.*no {protocol}.*refused"):
+        load(config(port=port), 0)
+    with (
+        serving(street(), tmp_path, "hang@0", protocol=protocol) as port,
+        pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port}.*{silent}"),
+    ):
+        load(config(port=port, timeout_s=1.0), 0)
+
+
+def test_a_server_that_is_old_or_another_is_named(monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
         with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port}.*is not UnrealCV"):
