@@ -109,19 +109,13 @@ def make_flight(
     # A shifted camera is aimed anew, as the renderer aims it.
     rotations[:, :2] += np.degrees(np.subtract(look_at(positions, targets), aimed_before).T)
     camera = Camera(width_px, height_px, intrinsic_matrix(width_px, height_px, 60.0))
-    poses = map(world_from_camera, positions, rotations)
-    views = [view_target(target, pose, camera) for target, pose in zip(targets, poses, strict=True)]
-    in_view = np.array([view.in_view for view in views])
+    seen = seen_by(camera, positions, rotations, targets)
     shares = [_visible_share(scene, target, position) for target, position in zip(targets, positions, strict=True)]
-    visibility = np.where(in_view, shares, 0.0)
+    visibility = np.where(seen["in_view"], shares, 0.0)
     flight = Track(
         town=town, trajectory=trajectory, variant=variant, camera=camera, time_s=np.arange(num_points) * DT_S,
         positions_m=positions, rotations_deg=rotations, targets_m=targets,
-        target=TargetRecord(
-            in_view=in_view, visible=visibility >= 0.3, depth_m=np.array([view.depth_m for view in views]),
-            uv=np.where(in_view[:, None], [view.uv for view in views], np.nan),
-            bbox=np.array([view.bbox_px for view in views]), visibility=visibility,
-        ),
+        target=TargetRecord(**seen, visible=visibility >= 0.3, visibility=visibility),
         perturbation=Perturbation(np.full(num_points, variant != "ORI"), drone_offsets, rotation_offsets, zero.copy()),
         source={
             "path_index": seed, "scenario_id": f"specimen_{seed}", "scenario_name": "specimen", "algorithm": "muco",
@@ -129,6 +123,16 @@ def make_flight(
         is_original=variant == "ORI",
     )  # fmt: skip
     return flight, scene
+
+
+def seen_by(camera: Camera, positions_m: np.ndarray, rotations_deg: np.ndarray, targets_m: np.ndarray) -> dict:
+    """Give what a target record says of the view of a camera."""
+    poses = map(world_from_camera, positions_m, rotations_deg)
+    views = [view_target(target_m, pose, camera) for target_m, pose in zip(targets_m, poses, strict=True)]
+    in_view = np.array([view.in_view for view in views])
+    uv = np.where(in_view[:, None], [view.uv for view in views], np.nan)
+    columns = {"depth_m": [view.depth_m for view in views], "bbox": [view.bbox_px for view in views]}
+    return {"in_view": in_view, "uv": uv, **{name: np.array(values) for name, values in columns.items()}}
 
 
 def _walk(num_points: int, rng: np.random.Generator) -> np.ndarray:

@@ -209,10 +209,7 @@ def test_what_nodes_repeat_is_counted_before_it_is_placed(tmp_path: Path) -> Non
     assert len(meshes) == 3_000
     np.testing.assert_allclose(meshes["2999"][0, 0], [0, -2_999, 0])  # +z of glTF is -y
     primitive = {"attributes": {"POSITION": 0}}
-    for changes in (
-        {"nodes": [{"mesh": 0}] * 3_000},
-        {"meshes": [{"primitives": [primitive] * 3_000}]},
-    ):
+    for changes in ({"nodes": [{"mesh": 0}] * 3_000}, {"meshes": [{"primitives": [primitive] * 3_000}]}):
         changes |= {"accessors": [{**ONE_ACCESSOR, "count": 3_000}]}  # of which the file has three
         (tmp_path / "many.glb").write_bytes(one_triangle(FLAT, **changes))
         with pytest.raises(InputError, match="got 3,000,000 triangles"):

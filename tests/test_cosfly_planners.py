@@ -9,16 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
-from specimens_planning import (
-    CANYON,
-    WORLDS,
-    assert_safe,
-    scenario_of,
-    solved_by_scipy,
-    town_of,
-    walk_along,
-    written,
-)
+from specimens_planning import CANYON, WORLDS, assert_safe, scenario_of, solved_by_scipy, town_of, walk_along, written
 
 import cosfly.planners.stage as planners
 from cosfly.formats.traces import read_traces

@@ -12,17 +12,16 @@ from caption.stage.windows import cut_windows
 from caption.verification.actions import TABLE as ACTION_TABLE
 from caption.verification.actions import measure
 from cosfly.formats.captions import TOKENS
-from cosfly.formats.frames import LEGIBLE_HEIGHT_PX, Camera
+from cosfly.formats.frames import LEGIBLE_HEIGHT_PX
 from cosfly.formats.pedestrian_paths import paces_of
 from cosfly.formats.traces import DroneTrace
 from cosfly.geometry import kernels
-from cosfly.geometry.axes import intrinsic_matrix, look_at, world_from_camera, wrap_deg
+from cosfly.geometry.axes import look_at, wrap_deg
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.planners.reference_trajectory import finds_again
 from cosfly.planners.stage import plan_trajectory
 from cosfly.planners.styles import FOLLOW, NAMES, REACQUIRE, RETURN_HOME, TABLE
-from cosfly.render.camera import view_target
 from cosfly.runtime.config import load, shipped
 
 OPEN = kernels.obstacle_index(town_of())
@@ -120,13 +119,9 @@ ORDERS, DECISIONS_LEAST, STYLE_MOST = {"break_off", "return_to_home"}, 0.02, 0.3
 def heights_px(trace, cfg):
     """Of the target in every tenth frame that has it in view, at each field of view."""
     for fov_deg in cfg.fovs_deg:
-        camera = Camera(cfg.width_px, cfg.height_px, intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg))
-        for place_m, rotation_deg, target_m in zip(
-            trace.positions_m[::10], trace.rotations_deg[::10], trace.targets_m[::10], strict=True
-        ):
-            view = view_target(target_m, world_from_camera(place_m, rotation_deg), camera)
-            if view.in_view:
-                yield view.bbox_px[3] - view.bbox_px[1]
+        target = track_of(trace, (cfg.width_px, cfg.height_px), fov_deg).target
+        box = target.bbox[::10][target.in_view[::10]]
+        yield from box[:, 3] - box[:, 1]
 
 
 @pytest.mark.slow
