@@ -94,7 +94,7 @@ def test_gradient_is_the_derivative_of_the_loss():
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_the_loss_never_rises_and_the_flight_is_safe(world):
+def test_the_loss_never_rises_to_near_that_of_a_general_solver_and_the_flight_is_safe(world):
     scenario, obstacles = scenario_of(world)
     problem = muco.make_problem(scenario, CFG)
     first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
@@ -107,16 +107,8 @@ def test_the_loss_never_rises_and_the_flight_is_safe(world):
     if len(points) > 20:
         assert history[-1] < 0.8 * history[0]
     np.testing.assert_array_equal(points[[0, -1]], first[[0, -1]])
-
-
-@pytest.mark.parametrize("world", ["corner", "tower_midway"])
-def test_the_end_is_within_five_percent_of_a_general_solver(world):
-    scenario, obstacles = scenario_of(world)
-    problem = muco.make_problem(scenario, CFG)
-    first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
-    _, solver, _ = muco.optimize(first, problem, obstacles, CFG.muco)
-    general = solved_by_scipy(first, problem, obstacles, maxiter=400, maxfun=800)
-    assert solver["loss_end"] <= 1.05 * general.fun
+    if world in ("corner", "tower_midway"):
+        assert history[-1] <= 1.05 * solved_by_scipy(first, problem, obstacles, maxiter=400, maxfun=800).fun
 
 
 @pytest.mark.parametrize("name", ["five_ray_mean", "accel_rms_mps2", "jerk_rms_mps3"])

@@ -40,12 +40,14 @@ from release.build.config import ReleaseConfig
 from release.build.sources import Source
 from release.record import read_record
 from release.verify.verify import verify
-from specimens import change_json, make_playback_tree
+from specimens import change_json
+
+TOWNS, NAMES = ("Town01", "Town02_Opt"), ("trajectory_1777083733", "trajectory_1777090000")
 
 
 @pytest.fixture(scope="module")
 def foreign(tmp_path_factory) -> Path:
-    return write_foreign_tree(tmp_path_factory.mktemp("foreign"))
+    return write_foreign_tree(tmp_path_factory.mktemp("foreign"), towns=TOWNS, trajectories=NAMES)
 
 
 TRAJECTORY = "Town01/trajectory_1777083733"
@@ -245,11 +247,6 @@ def test_of_a_foreign_tree_what_was_inspected_is_released_and_nothing_else(tmp_p
         failed("c", replace(source, inspect=alone / "inspect.json"))
 
 
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory):
-    return make_playback_tree(tmp_path_factory.mktemp("tree"), num_flights=1, num_points=6)
-
-
 def rewrite(folder, target, change):
     new = target / "Town01" / folder.parent.name / folder.name
     new.mkdir(parents=True, exist_ok=True)
@@ -272,32 +269,22 @@ def test_deviations_from_the_layout_are_noted(tree, tmp_path):
         assert re.search(words, str(first)), words
 
 
-TOWNS, NAMES = ("Town01", "Town02_Opt"), ("trajectory_1777083733", "trajectory_1777090000")
+def names(foreign: Path, **choice) -> list[str]:
+    return [folder.relative_to(foreign).as_posix() for folder in find_tracks(foreign, TrackChoice(**choice))]
 
 
-@pytest.fixture(scope="module")
-def of_towns(tmp_path_factory) -> Path:
-    return write_foreign_tree(
-        tmp_path_factory.mktemp("public") / "tree", towns=TOWNS, trajectories=NAMES, num_points=14
-    )
-
-
-def names(of_towns: Path, **choice) -> list[str]:
-    return [folder.relative_to(of_towns).as_posix() for folder in find_tracks(of_towns, TrackChoice(**choice))]
-
-
-def test_patterns_are_of_folders_and_those_above_them(of_towns):
+def test_patterns_are_of_folders_and_those_above_them(foreign):
     for choice, count in (
         ({}, 8), ({"match": ("Town01",)}, 4), ({"match": ("Town0[12]*/trajectory_177708*",)}, 4),
         ({"match": ("*/ORI",)}, 4),
         ({"match": ("Town01/trajectory_1777083733/ORI", "Town02_Opt/trajectory_1777090000/")}, 3),
         ({"tracks": ("clean",)}, 4), ({"match": ("Town02*",), "tracks": ("perturbed",)}, 2),
     ):  # fmt: skip
-        found = names(of_towns, **choice)
+        found = names(foreign, **choice)
         assert len(found) == count
-        assert set(found) <= set(names(of_towns))
+        assert set(found) <= set(names(foreign))
     words = r"no track folder in this directory matches the patterns of --flights; got Town9; .*Town01/trajectory_1777083733/ORI"
     with pytest.raises(InputError, match=words):
-        names(of_towns, match=("Town9",))
+        names(foreign, match=("Town9",))
     with pytest.raises(InputError, match="this directory has no perturbed track among those that match --flights"):
-        names(of_towns, match=("*/ORI",), tracks=("perturbed",))
+        names(foreign, match=("*/ORI",), tracks=("perturbed",))

@@ -188,7 +188,6 @@ def stand_in(monkeypatch):
         dies_after = None
         awaited = 0  # nothing is finished until so many were asked, or half a minute is over
         finish_reason = "stop"
-        num_loaded = 0
 
         def __init__(self, **arguments) -> None:
             structured = arguments["structured_outputs_config"]
@@ -196,7 +195,6 @@ def stand_in(monkeypatch):
                 raise ValueError("disable_any_whitespace is only supported for xgrammar and guidance backends.")
             if "gdn_prefil" in arguments:
                 raise TypeError("EngineArgs.__init__() got an unexpected keyword argument 'gdn_prefil'")
-            Engine.num_loaded += 1
             self.llm_engine = self
             self.open: list = []
 
