@@ -79,14 +79,13 @@ def test_a_command_that_cannot_be_flown_is_the_students_failure_and_the_drone_ho
     assert under_way.moments[-1].index == moment.index + 1
 
 
-LOOK = {"width_px": 160, "height_px": 90, "fovs_deg": (90.0,)}
 PITCH_DEG = -44.0
 
 
 @pytest.fixture(scope="module")
 def airspace():
     town = town_of(*CANYON)
-    airspace = Airspace(RenderConfig(**LOOK), town, town, seed=1)
+    airspace = Airspace(RenderConfig(width_px=160, height_px=90, fovs_deg=(90.0,)), town, town, seed=1)
     yield airspace
     airspace.renderer.close()
 

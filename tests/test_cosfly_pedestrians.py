@@ -88,8 +88,8 @@ def test_a_walk_keeps_every_promise(number, dt_s):
 
 def test_a_line_crosses_the_cells_that_geometry_says():
     rng = np.random.default_rng(5)
-    costs = np.array([1, 9])
-    num_blocked = 0
+    costs, num_blocked = np.array([1, 9]), 0
+    cells = {(x, y): box(x - 0.5, y - 0.5, x + 0.5, y + 0.5) for x, y in np.ndindex(7, 7)}
     for _ in range(300):
         free, classes = rng.random((7, 7)) < 0.9, rng.integers(0, 2, (7, 7)).astype(np.uint8)
         start, end = rng.integers(0, 7, (2, 2))
@@ -97,17 +97,12 @@ def test_a_line_crosses_the_cells_that_geometry_says():
         if (start == end).all():
             continue
         line = LineString([start, end])
-        crossed = [
-            (x, y) for x in range(7) for y in range(7) if line.intersects(box(x - 0.5, y - 0.5, x + 0.5, y + 0.5))
-        ]
-        if all(free[y, x] for x, y in crossed):
-            through = [  # longer than a touched corner
-                (x, y) for x, y in crossed if line.intersection(box(x - 0.5, y - 0.5, x + 0.5, y + 0.5)).length > 1e-9
-            ]
+        expected = np.inf
+        if all(free[y, x] for (x, y), cell in cells.items() if line.intersects(cell)):
+            # Longer than a touched corner.
+            through = [place for place, cell in cells.items() if line.intersection(cell).length > 1e-9]
             expected = np.mean([costs[classes[y, x]] for x, y in through]) * line.length
-        else:
-            expected = np.inf
-            num_blocked += 1
+        num_blocked += np.isinf(expected)
         assert _line_cost(start, end, free, classes, costs) == pytest.approx(expected)
     assert 50 < num_blocked < 250
 

@@ -1,5 +1,6 @@
 """MuCO's terms and the pedestrians' search against plain versions, whole flights over hand-made maps, the plan stage."""
 
+import itertools
 import json
 from dataclasses import replace
 
@@ -187,17 +188,13 @@ def test_a_flight_is_planned_on_from_a_place_and_a_velocity(place_m, velocity_mp
 
 
 def shortest_costs(free: np.ndarray, start: tuple[int, int], classes: np.ndarray, costs: np.ndarray) -> np.ndarray:
-    num_y, num_x = free.shape
-    rows, columns, weights = [], [], []
-    for y in range(num_y):
-        for x in range(num_x):
-            for dx, dy in ((1, 0), (0, 1), (1, 1), (-1, 1)):
-                a, b = x + dx, y + dy
-                if not (0 <= a < num_x and 0 <= b < num_y and free[y, x] and free[b, a] and free[y, a] and free[b, x]):
-                    continue
-                rows.append(y * num_x + x)
-                columns.append(b * num_x + a)
-                weights.append(np.hypot(dx, dy) * (costs[classes[y, x]] + costs[classes[b, a]]) / 2)
+    (num_y, num_x), edges = free.shape, []
+    for (y, x), (dx, dy) in itertools.product(np.ndindex(free.shape), ((1, 0), (0, 1), (1, 1), (-1, 1))):
+        a, b = x + dx, y + dy
+        if 0 <= a < num_x and b < num_y and free[y, x] and free[b, a] and free[y, a] and free[b, x]:
+            cost = np.hypot(dx, dy) * (costs[classes[y, x]] + costs[classes[b, a]]) / 2
+            edges.append((y * num_x + x, b * num_x + a, cost))
+    rows, columns, weights = np.array(edges).reshape(-1, 3).T
     graph = coo_matrix((weights, (rows, columns)), shape=(free.size, free.size)).tocsr()
     return dijkstra(graph, directed=False, indices=start[1] * num_x + start[0]).reshape(free.shape)
 

@@ -62,32 +62,22 @@ def test_decisions_are_on_record_and_the_last_one_counts(product):
     assert one.sha256 == read_inspection(product).flights[1].sha256
 
 
-def test_results_and_funnel_are_those_after_review(product):
-    before = product.read_bytes()
-    flights = folders_of(product)
-    decide(product, "accepted", *flights[:3])
-    decide(product, "rejected", flights[3])
+def test_results_funnel_and_release_are_those_after_review(product, inspected):
+    before, flights = product.read_bytes(), folders_of(product)
+    source = Source("run", inspected.parent.parent / "tree", product, product)  # captions are not read here
+    take = lambda: [one.dropped for one in gather([source], include_review=False).candidates]  # noqa: E731
+    assert take() == ["review: smoothness"] * 4
+    decide(product, "accepted", *flights[:2])
+    decide(product, "rejected", flights[2])
+    assert take() == [None, None, "rejected: review", "review: smoothness"]
     settled = read_settled(product)
-    assert [flight.result for flight in settled.flights] == ["accepted"] * 3 + ["rejected"]
-    assert settled.flights[3].reason == "review"
+    assert [flight.result for flight in settled.flights] == ["accepted", "accepted", "rejected", "review"]
+    assert settled.flights[2].reason == "review"
     counts = settled.funnel.trajectories
     assert (counts.accepted, counts.review, counts.rejected) == (1, 0, 1)
     assert product.read_bytes() == before
     assert "decided" not in json.dumps(settled.model_dump(mode="json")["flights"])
-
-
-def test_the_release_takes_what_was_accepted(product, inspected, monkeypatch):
-    tree = inspected.parent.parent / "tree"
-    source = Source("run", tree, product, product)  # captions are not read here
-    take = lambda: gather([source], include_review=False)  # noqa: E731
-    assert {one.dropped for one in take().candidates} == {"review: smoothness"}
-    flights = folders_of(product)
-    decide(product, "accepted", *flights[:2])
-    decide(product, "rejected", flights[2])
-    assert [one.dropped for one in take().candidates] == [None, None, "rejected: review", "review: smoothness"]
-    assert source.files["review"] == product.with_name(REVIEW), (
-        "an input of the stage: a later decision is another input"
-    )
+    assert source.files["review"] == product.with_name(REVIEW), "an input of the stage, as a later decision is another"
 
 
 def test_the_command_decides_and_says_what_is_open(product):
