@@ -246,23 +246,10 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
 ]  # fmt: skip
 
 
-def test_texts(subtests):
-    for name, text, outcome in TEXTS:
-        with subtests.test(name=name):
-            parsed = parse_answer(text)
-            if isinstance(outcome, tuple):
-                assert parsed.coc == Coc(**GOOD) or "control_characters" in outcome, parsed
-                assert parsed.recovered == outcome
-            elif parsed.coc is None:
-                assert parsed.reason == outcome
-            else:
-                assert parsed.coc.reasoning_trace == outcome
-
-
-# The same of Chinese answers; None: the object as it stands.
-CHINESE_TEXTS: list[tuple[str, str, str | None]] = [
-    ("any model", ZH, None),
-    ("Qwen: Chinese prose round it", f"好的，以下是翻译结果：\n```json\n{ZH}\n```\n希望对您有帮助！", None),
+# The same of Chinese answers.
+CHINESE_TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
+    ("any model", ZH, ()),
+    ("Qwen: Chinese prose round it", f"好的，以下是翻译结果：\n```json\n{ZH}\n```\n希望对您有帮助！", (FENCE, PROSE)),
     ("any model: English for Chinese", TEXT, "critical_components_wrong_language"),
     ("small models: one field left in English", json.dumps(CHINESE | {"reasoning_trace": GOOD["reasoning_trace"]}),
         "reasoning_trace_wrong_language"),
@@ -272,14 +259,18 @@ CHINESE_TEXTS: list[tuple[str, str, str | None]] = [
 ]  # fmt: skip
 
 
-def test_chinese_texts():
-    for text, outcome in [case[1:] for case in CHINESE_TEXTS]:
-        parsed = parse_answer(text, "zh")
-        if parsed.coc is None:
-            assert parsed.reason == outcome
-        else:
-            assert parsed.coc.reasoning_trace == (outcome or CHINESE["reasoning_trace"])
-            assert outcome or parsed.coc == Coc(**CHINESE)
+@pytest.mark.parametrize(("language", "cases", "whole"), [("en", TEXTS, GOOD), ("zh", CHINESE_TEXTS, CHINESE)])
+def test_texts(language, cases, whole, subtests):
+    for name, text, outcome in cases:
+        with subtests.test(name=name):
+            parsed = parse_answer(text, language)
+            if isinstance(outcome, tuple):
+                assert parsed.coc == Coc(**whole) or "control_characters" in outcome, parsed
+                assert parsed.recovered == outcome
+            elif parsed.coc is None:
+                assert parsed.reason == outcome
+            else:
+                assert parsed.coc.reasoning_trace == outcome
 
 
 # How decisions are spelled; what they are read as.

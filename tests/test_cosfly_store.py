@@ -209,16 +209,6 @@ def test_a_link_is_replaced_and_what_it_points_to_is_kept(tmp_path):
     assert not any((tmp_path / name).is_symlink() for name in ("file", "folder", "new"))
 
 
-def test_atomic_folder(tmp_path):
-    with pytest.raises(ZeroDivisionError), store.atomic_folder(tmp_path / "f") as partial:
-        write_bytes(partial / "a", bytes(1 // 0))
-    assert list(tmp_path.iterdir()) == []
-    with store.atomic_folder(tmp_path / "f") as partial:
-        write_bytes(partial / "a", b"1")
-        assert not (tmp_path / "f").exists()
-    assert (tmp_path / "f/a").read_bytes() == b"1"
-
-
 def test_checksums_round_trip(tmp_path):
     digests = {"b/c.txt": "0" * 64, "a.txt": "f" * 64}
     store.write_checksums(tmp_path, digests)
