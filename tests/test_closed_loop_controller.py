@@ -128,16 +128,13 @@ def test_who_flies_into_the_ground_or_a_house_has_crashed_before_it_and_flies_no
             flight.step(np.zeros(5))
 
 
-def test_who_leaves_the_person_is_lost_and_who_leaves_the_map_has_left(airspace, planned):
+def test_who_leaves_the_person_is_lost_and_who_leaves_the_map_has_left(airspace, planned, monkeypatch):
     flight = ClosedLoopTrajectory(airspace, planned, lost_s=2.0)
     after(flight, *[(0, 0, 0, 60.0)] * 3, *[(0, 0, 0, 0.0)] * 20)
     assert flight.ended == "lost"
     small = ClosedLoopTrajectory(airspace, planned)
-    small.airspace.bounds_m, kept = (np.full(3, 0.0), np.full(3, 1.0)), small.airspace.bounds_m
-    try:
-        after(small, *[(-10.0, 0, 4.0, 0)] * 40)
-    finally:
-        small.airspace.bounds_m = kept
+    monkeypatch.setattr(small.airspace, "bounds_m", (np.full(3, 0.0), np.full(3, 1.0)))
+    after(small, *[(-10.0, 0, 4.0, 0)] * 40)
     assert small.ended == "left"
 
 

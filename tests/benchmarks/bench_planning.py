@@ -12,8 +12,7 @@ import scenes
 
 from cosfly.formats.boxes import BoxMap, write_boxes
 from cosfly.geometry.kernels import BoxIndex, obstacle_index
-from cosfly.pedestrians.stage import PedestriansConfig, make_pedestrian, run, walkable_ground
-from cosfly.pedestrians.walkable import WalkableGround
+from cosfly.pedestrians.stage import PedestriansConfig, run
 from cosfly.planners.contract import PLANNERS, PlanConfig, Scenario, load_planner
 from cosfly.planners.stage import make_scenario
 from cosfly.runtime.errors import NoPathError
@@ -32,21 +31,14 @@ def simplification(maps: dict[str, BoxMap]) -> None:
     scenes.print_table("simplify", ["map", "boxes", "left", "s"], rows)
 
 
-def make_walks(box_map: BoxMap) -> WalkableGround:
-    ground = walkable_ground(box_map, WALKS)
-    for name in (f"path_{k:05d}" for k in range(WALKS.num_paths)):
-        make_pedestrian(name, ground, WALKS, rng_for(scenes.SEED, "pedestrians", name))
-    return ground
-
-
 def walking(maps: dict[str, BoxMap]) -> None:
     rows = []
     for name, box_map in maps.items():
-        times = [scenes.cpu_ms(lambda box_map=box_map: make_walks(box_map)) for _ in range(3)]
+        times = [scenes.cpu_ms(lambda box_map=box_map: scenes.walks_on(box_map)) for _ in range(3)]
         with tempfile.TemporaryDirectory() as folder:
             write_boxes(Path(folder) / "map.json", box_map)
             whole_ms, _ = scenes.cpu_ms(lambda f=Path(folder): run(WALKS, f / "map.json", f / "out"))
-        size, best_s = " x ".join(map(str, times[-1][1].grid.size)), min(ms for ms, _ in times) / 1e3
+        size, best_s = " x ".join(map(str, times[-1][1][0].grid.size)), min(ms for ms, _ in times) / 1e3
         rows.append([name, len(box_map), size, best_s, whole_ms / 1e3])
     names = ["map", "boxes", "grid", "without files and report, s", "whole stage, s"]
     scenes.print_table(f"{WALKS.num_paths} pedestrian trajectories", names, rows)
@@ -61,7 +53,7 @@ def ground_stages() -> None:
         raw |= {"(b) city": city}
         tiled = scenes.cut_to(scenes.tiled(city, columns, lines), BIG_M)
         simple[f"(b) tiled {columns} x {lines}, cut"] = scenes.simplified(tiled)
-    make_walks(simple["(a) town"])  # compiles
+    scenes.walks_on(simple["(a) town"])  # compiles
     simplification(raw)
     walking(simple)
 
@@ -90,7 +82,7 @@ def main() -> None:
     ground_stages()
     cfg, town, rows = PlanConfig(), scenes.simplified(scenes.town()), []
     obstacles = obstacle_index(town)
-    scenarios = [make_scenario(walk, obstacles, cfg) for walk in scenes.walks_on(town)]
+    scenarios = [make_scenario(walk, obstacles, cfg) for walk in scenes.walks_on(town, min_distance_m=75.0)[1]]
     for planner in options.planners:
         warm_up_ms, _ = scenes.cpu_ms(lambda p=planner: measure(p, scenarios[:2], obstacles, cfg))
         print(f"{planner}: first two flights with compilation or its cache {warm_up_ms / 1e3:.2f} s")

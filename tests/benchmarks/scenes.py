@@ -15,6 +15,7 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.pedestrians.stage import PedestriansConfig, make_pedestrian, walkable_ground
+from cosfly.pedestrians.walkable import WalkableGround
 from cosfly.runtime.config import build
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import SimplifyConfig, simplify
@@ -62,12 +63,12 @@ def simplified(raw: BoxMap) -> BoxMap:
     return simplify(raw, SimplifyConfig())
 
 
-def walks_on(box_map: BoxMap) -> list[PedestrianTrajectory]:
-    """20 walks of 75 to 100 m as the crow flies: about 186 points, the length of the paper's pilot."""
-    cfg = PedestriansConfig(num_paths=NUM_WALKS, min_distance_m=75.0)
+def walks_on(box_map: BoxMap, **settings: Any) -> tuple[WalkableGround, list[PedestrianTrajectory]]:
+    """The ground, and 20 walks; of 75 to 100 m as the crow flies they have about 186 points, as the paper's pilot."""
+    cfg = PedestriansConfig(num_paths=NUM_WALKS, **settings)
     ground = walkable_ground(box_map, cfg)
     names = [f"path_{k:05d}" for k in range(cfg.num_paths)]
-    return [make_pedestrian(name, ground, cfg, rng_for(SEED, "pedestrians", name)).trajectory for name in names]
+    return ground, [make_pedestrian(name, ground, cfg, rng_for(SEED, "pedestrians", name)).trajectory for name in names]
 
 
 def cpu_ms(function: Callable[[], Any]) -> tuple[float, Any]:
