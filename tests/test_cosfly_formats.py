@@ -14,7 +14,6 @@ from cosfly.formats.episodes import Episode, EpisodeFrame, episode_file, read_ep
 from cosfly.formats.frames import PERSON_ID
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths, write_paths
 from cosfly.formats.people import GOAL_TERMS, Appearance, Goal, People, read_goal
-from cosfly.formats.roi import read_roi
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
 from cosfly.geometry.goals import SIDES, SLOTS, SeenFrame, find_says, meant, words_of
 from cosfly.render.person import choose_appearance, choose_look_alike
@@ -63,15 +62,6 @@ def test_fields_of_a_map_that_contradict_each_other_are_named(tmp_path, change, 
     change_json(tmp_path / "boxes_3d.json", change)
     with pytest.raises(InputError, match=words):
         read_boxes(tmp_path / "boxes_3d.json")
-
-
-def test_roi_forms(tmp_path):
-    path = tmp_path / "roi_polygon.json"
-    square = [[0, 0], [10, 0], [10, 10]]
-    path.write_text(json.dumps({"description": "d", "closed": True, "points_world": square}))
-    assert len(read_roi(path).rings()) == 1
-    path.write_text(json.dumps({"polygons": [{"points_world": square, "holes": [square]}, {"points_world": square}]}))
-    assert [len(p.holes) for p in read_roi(path).rings()] == [1, 0]
 
 
 T_S = np.arange(4) * 0.5

@@ -17,18 +17,9 @@ from cosfly.planners.contract import PLANNERS, PlanConfig, Scenario, load_planne
 from cosfly.planners.stage import make_scenario
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.seeding import rng_for
-from cosfly.simplify.passes import SimplifyConfig, simplify
 
 WALKS = PedestriansConfig(num_paths=scenes.NUM_WALKS)
 BIG_M = (3784 * 0.5, 2357 * 0.5)  # the largest map of the paper
-
-
-def simplification(maps: dict[str, BoxMap]) -> None:
-    rows = []
-    for name, raw in maps.items():
-        times = [scenes.cpu_ms(lambda raw=raw: simplify(raw, SimplifyConfig())) for _ in range(3)]
-        rows.append([name, len(raw), len(times[-1][1]), min(ms for ms, _ in times) / 1e3])
-    scenes.print_table("simplify", ["map", "boxes", "left", "s"], rows)
 
 
 def walking(maps: dict[str, BoxMap]) -> None:
@@ -46,16 +37,14 @@ def walking(maps: dict[str, BoxMap]) -> None:
 
 def ground_stages() -> None:
     town, city = scenes.town(), scenes.city()
-    raw, simple = {"(a) town": town}, {"(a) town": scenes.simplified(town)}
+    maps = {"(a) town": scenes.simplified(town)}
+    times_ms = [scenes.cpu_ms(lambda: scenes.simplified(town))[0] for _ in range(3)]
+    rows = [["(a) town", len(town), len(maps["(a) town"]), min(times_ms) / 1e3]]
+    scenes.print_table("simplify", ["map", "boxes", "left", "s"], rows)
     if city is not None:
-        low, high = city.bounds()
-        columns, lines = (int(np.ceil(BIG_M[k] / (high[k] - low[k]))) for k in (0, 1))
-        raw |= {"(b) city": city}
-        tiled = scenes.cut_to(scenes.tiled(city, columns, lines), BIG_M)
-        simple[f"(b) tiled {columns} x {lines}, cut"] = scenes.simplified(tiled)
-    scenes.walks_on(simple["(a) town"])  # compiles
-    simplification(raw)
-    walking(simple)
+        maps["(b) city, tiled"] = scenes.simplified(scenes.tiled(city, BIG_M))
+    scenes.walks_on(maps["(a) town"])  # compiles
+    walking(maps)
 
 
 def measure(planner: str, scenarios: list[Scenario], obstacles: BoxIndex, cfg: PlanConfig) -> list:
