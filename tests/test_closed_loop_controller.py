@@ -155,11 +155,15 @@ def of(one):
     return {name: a / b if b else None for name, (a, b) in measure_episode(one).sums.items()}
 
 
-def test_a_flight_that_is_counted_by_hand():
+def test_flights_that_are_counted_by_hand():
     found = of(flight("1100001101", num_walk_frames=20, ended="left"))  # one loss of 4 frames, one blink
     assert found["visible"] == 5 / 20
     assert (found["tracked_frames"], found["lost"]) == (5, 1)
     assert (found["kept_s"], found["success"], found["left"], found["crashed"]) == (1.0, 0, 1, 0)
+    answers, actions = ["ok", "late", "ok", "ok", "ok"], ["hover", None, "yaw_left", "yaw_left", "hover"]
+    one = flight("11111", answer=answers, action=actions)
+    assert of(one)["no_decision"] == 1 / 5
+    assert sum(measure_episode(one).answers.values()) == len(one.decisions)
 
 
 def test_success_is_what_stands_in_the_module():
@@ -173,13 +177,6 @@ def test_success_is_what_stands_in_the_module():
         ("1111", {"distance_m": [20.0, 60.0, 20.0, 20.0, 20.0]}, 1),
     ]:  # fmt: skip
         assert of(flight(seen, **more))["success"] == success
-
-
-def test_failed_decisions_are_counted():
-    answers, actions = ["ok", "late", "ok", "ok", "ok"], ["hover", None, "yaw_left", "yaw_left", "hover"]
-    one = flight("11111", answer=answers, action=actions)
-    assert of(one)["no_decision"] == 1 / 5
-    assert sum(measure_episode(one).answers.values()) == len(one.decisions)
 
 
 def test_a_score_adds_up_and_is_read_as_written(tmp_path):

@@ -231,9 +231,6 @@ def test_a_box_names_no_file_outside_of_its_folder(tmp_path: Path) -> None:
             read_boxes(path)
 
 
-SQUARE = np.array([(0, 0, 0), (4, 0, 0), (4, 4, 0), (0, 4, 0)], dtype=float)
-
-
 ROOF = [  # a house of 10 x 8 m, eaves at 4 m, ridge at 7 m
     (0, 0, 1), (10, 0, 1), (10, 8, 1), (0, 8, 1), (0, 0, 4), (10, 0, 4), (10, 8, 4), (0, 8, 4), (0, 4, 7), (10, 4, 7),
 ]  # fmt: skip
@@ -331,7 +328,7 @@ def traced_views(tmp_path_factory) -> tuple[BoxMap, list[tuple[np.ndarray, np.nd
         for row in (0, 5)
     ]  # fmt: skip
     x, y, z = [*scene_origin(box_map)[:2], plane_z_m(box_map) - GROUND_PLANE_DROP_M]
-    plane = SQUARE / 2.0 * GROUND_PLANE_HALF_M - GROUND_PLANE_HALF_M * np.array([1, 1, 0]) + (x, y, z)
+    plane = GROUND_PLANE_HALF_M * np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) + (x, y, z)
     boxes.append(trimesh.Trimesh(plane, [(0, 1, 2), (0, 2, 3)]))
     triangles = np.concatenate([solids.corners_m, *(np.asarray(box.triangles) for box in boxes)])
     owners = np.concatenate([box_map.ids[solids.rows].astype(int), np.full(12, 7), np.full(12, 12), [NO_INSTANCE] * 2])

@@ -17,7 +17,6 @@ from specimens import map_of
 
 VEGETATION, BUILDINGS, STATIC, ROADS = (KINDS[name] for name in ("Vegetation", "Buildings", "Static", "Roads"))
 PASSES = ["input", "merge", "crop_tree", "crop_below_ground", "prune_nested"]
-PAPER = {"min_fill": 0.0, "min_canopy_fill": 0.0, "trunk": "full"}
 
 
 def box_map(*rows, ids=None) -> BoxMap:
@@ -163,7 +162,8 @@ def test_nested_boxes_of_one_kind_go(inner, kind, kept):
 @given(seed=st.integers(0, 10**6), paper=st.booleans())
 def test_the_whole_keeps_its_books(seed, paper):
     boxes = random_map(seed, 80)
-    result = simplify(boxes, SimplifyConfig(**(PAPER if paper else {})))
+    of_paper = SimplifyConfig(min_fill=0.0, min_canopy_fill=0.0, trunk="full")
+    result = simplify(boxes, of_paper if paper else SimplifyConfig())
     ids = result.ids.tolist()
     assert len(set(ids)) == len(ids)
     assert [one.name for one in result.header.passes] == PASSES

@@ -225,15 +225,12 @@ def test_smooth_draws_have_the_stated_covariance(correlation_s):
 FEW = ("foresight", "track_astar", "muco", "minimum_jerk", "theta_star")
 
 
-def test_the_weights_are_those_of_the_papers_printed_scores():
+def test_the_weights_are_those_of_the_papers_printed_scores_and_every_planner_has_its_group():
     rows = read_paper().tables["tab:appendix_h_extended_ranking"].paper_rows
     assert set(rows) == {title_of(name) for name in ALL_PLANNERS} - {"foresight"}
     for score, *normalized in rows.values():
         assert np.dot(normalized, [weight for *_, weight in CRITERIA.values()]) == pytest.approx(score, abs=1e-4)
     assert list(CRITERIA) == ["visibility", "collision", "clearance"]
-
-
-def test_every_planner_has_its_group():
     assert sorted(compare.GROUP_OF) == sorted(ALL_PLANNERS)
 
 

@@ -113,9 +113,6 @@ def test_a_style_that_the_map_does_not_hold_is_dropped_or_followed_and_says_why(
     assert plan_trajectory(STRAIGHT, walled, fallback, 0).drop_reason is None
 
 
-ORDERS, DECISIONS_LEAST, STYLE_MOST = {"break_off", "return_to_home"}, 0.02, 0.3
-
-
 def heights_px(trace, cfg):
     """Of the target in every tenth frame that has it in view, at each field of view."""
     for fov_deg in cfg.fovs_deg:
@@ -133,15 +130,15 @@ def test_diverse_shows_each_decision_and_all_heights_and_distances_whatever_the_
     kept = [trace for trace in flights if trace.drop_reason is None]
     assert len(kept) >= 78
     labels = sum(map(labels_of, kept), Counter())
-    for name in set(TOKENS) - ORDERS:
-        assert labels[name] >= DECISIONS_LEAST * labels.total(), (name, labels)
+    for name in set(TOKENS) - {"break_off", "return_to_home"}:
+        assert labels[name] >= 0.02 * labels.total(), (name, labels)
     for over, low_m, high_m in ((2, 10, 50), (3, 12, 50)):
         away = np.concatenate([trace.positions_m - trace.targets_m for trace in kept])
         found_m = away[:, 2] + 0.9 if over == 2 else np.linalg.norm(away, axis=1)
         assert np.percentile(found_m, 5) <= low_m
         assert np.percentile(found_m, 95) >= high_m
     styles = Counter(part.style for trace in kept for part in trace.segments for _ in range(part.begin, part.end))
-    assert max(styles.values()) <= STYLE_MOST * sum(len(trace.time_s) for trace in kept)
+    assert max(styles.values()) <= 0.3 * sum(len(trace.time_s) for trace in kept)
     assert styles["hold"] > 0
     assert sum(trace.segments[0].style == REACQUIRE for trace in kept if trace.segments) >= 1
     assert min(trace.metrics["clearance_min_m"] for trace in kept) >= 3.0 - 1e-3

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import scenes
 
-from cosfly.formats.boxes import BoxMap, write_boxes
+from cosfly.formats.boxes import write_boxes
 from cosfly.geometry.kernels import BoxIndex, obstacle_index
 from cosfly.pedestrians.stage import PedestriansConfig, run
 from cosfly.planners.contract import PLANNERS, PlanConfig, Scenario, load_planner
@@ -22,7 +22,15 @@ WALKS = PedestriansConfig(num_paths=scenes.NUM_WALKS)
 BIG_M = (3784 * 0.5, 2357 * 0.5)  # the largest map of the paper
 
 
-def walking(maps: dict[str, BoxMap]) -> None:
+def ground_stages() -> None:
+    town, city = scenes.town(), scenes.city()
+    maps = {"(a) town": scenes.simplified(town)}
+    times_ms = [scenes.cpu_ms(lambda: scenes.simplified(town))[0] for _ in range(3)]
+    rows = [["(a) town", len(town), len(maps["(a) town"]), min(times_ms) / 1e3]]
+    scenes.print_table("simplify", ["map", "boxes", "left", "s"], rows)
+    if city is not None:
+        maps["(b) city, tiled"] = scenes.simplified(scenes.tiled(city, BIG_M))
+    scenes.walks_on(maps["(a) town"])  # compiles
     rows = []
     for name, box_map in maps.items():
         times = [scenes.cpu_ms(lambda box_map=box_map: scenes.walks_on(box_map)) for _ in range(3)]
@@ -33,18 +41,6 @@ def walking(maps: dict[str, BoxMap]) -> None:
         rows.append([name, len(box_map), size, best_s, whole_ms / 1e3])
     names = ["map", "boxes", "grid", "without files and report, s", "whole stage, s"]
     scenes.print_table(f"{WALKS.num_paths} pedestrian trajectories", names, rows)
-
-
-def ground_stages() -> None:
-    town, city = scenes.town(), scenes.city()
-    maps = {"(a) town": scenes.simplified(town)}
-    times_ms = [scenes.cpu_ms(lambda: scenes.simplified(town))[0] for _ in range(3)]
-    rows = [["(a) town", len(town), len(maps["(a) town"]), min(times_ms) / 1e3]]
-    scenes.print_table("simplify", ["map", "boxes", "left", "s"], rows)
-    if city is not None:
-        maps["(b) city, tiled"] = scenes.simplified(scenes.tiled(city, BIG_M))
-    scenes.walks_on(maps["(a) town"])  # compiles
-    walking(maps)
 
 
 def measure(planner: str, scenarios: list[Scenario], obstacles: BoxIndex, cfg: PlanConfig) -> list:
