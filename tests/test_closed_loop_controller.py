@@ -79,9 +79,6 @@ def test_a_command_that_cannot_be_flown_is_the_students_failure_and_the_drone_ho
     assert under_way.moments[-1].index == moment.index + 1
 
 
-PITCH_DEG = -44.0
-
-
 @pytest.fixture(scope="module")
 def airspace():
     town = town_of(*CANYON)
@@ -100,7 +97,7 @@ def after(flight: ClosedLoopTrajectory, *commands) -> list:
     moments = list(flight.reset())
     for command in commands:
         if flight.ended is None:
-            moments.append(flight.step(np.array([*command, PITCH_DEG])))
+            moments.append(flight.step(np.array([*command, -44.0])))  # its pitch
     return moments
 
 

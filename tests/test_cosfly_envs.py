@@ -30,7 +30,6 @@ from cosfly.runtime.pool import Watch
 
 FOLLOW, SMALL = "cosfly/Follow-v0", (160, 96)
 ROOT = Path(cosfly.envs.__file__).parents[2]
-DOCUMENT = ROOT / "docs" / "closed-loop.md"
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +209,7 @@ def test_nobody_trains_on_held_out_towns():
 
 
 def test_lists_are_fixed_and_their_digests_are_those_of_the_document():
-    text = DOCUMENT.read_text(encoding="utf-8")
+    text = (ROOT / "docs/closed-loop.md").read_text(encoding="utf-8")
     for task in TASKS:
         env, episodes, digest = read_list(f"{task}/test")
         assert (env, len(episodes), len({*episodes})) == (task, 20, 20)

@@ -298,11 +298,8 @@ def test_flying_the_actions_gives_the_plan():
     assert_allclose(motion.action[:-1, 4], shown.rotations_deg[1:, 0])
 
 
-STEP_S = 0.5
-
-
 def walk(num_points: int, *, begin: tuple[float, float] = (0.0, 0.0)):
-    time_s = np.arange(num_points) * STEP_S
+    time_s = np.arange(num_points) * 0.5
     return time_s, np.column_stack([begin[0] + 1.4 * time_s, np.full(num_points, begin[1]), np.full(num_points, 0.9)])
 
 

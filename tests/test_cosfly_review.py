@@ -23,8 +23,6 @@ from cosfly.runtime.io import sha256_file
 from release.build.sources import Source, gather
 from specimens import make_flight, make_playback_tree
 
-QUEUE = CFG.model_copy(update={"smoothness_min": 1.0})  # the plan of every flight is less smooth than that
-
 
 @pytest.fixture(scope="module")
 def inspected(tmp_path_factory) -> Path:
@@ -32,7 +30,8 @@ def inspected(tmp_path_factory) -> Path:
     tree = make_playback_tree(root / "tree", 2, 6, width_px=96, height_px=54)
     write_map(root)
     write_traces(root / "drone_trace.json", [plan_of(f) for f in find_tracks(tree) if f.name == "ORI"], {})
-    return run(QUEUE, root / "map.json", root / "drone_trace.json", tree, root / "inspect")
+    cfg = CFG.model_copy(update={"smoothness_min": 1.0})  # the plan of every flight is less smooth than that
+    return run(cfg, root / "map.json", root / "drone_trace.json", tree, root / "inspect")
 
 
 @pytest.fixture

@@ -38,12 +38,10 @@ from cosfly.runtime.journal import Journal
 from distill.inference import stage as infer
 from distill.schema import open_split
 
-OBEDIENT = deciding()
-
 
 def obedient(messages: list[dict], schema: dict) -> str:
     body = {"messages": messages, "response_format": {"json_schema": {"schema": schema}}}
-    return json.dumps(obedient_answer(OBEDIENT, body))
+    return json.dumps(obedient_answer(deciding(), body))
 
 
 class PlainEngine:

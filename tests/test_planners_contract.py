@@ -25,8 +25,7 @@ from cosfly.runtime.seeding import draw_smooth, rng_for
 
 UP_M = 30.0
 ON_A_HILL = {"on_a_hill": (town_of(*CANYON), [(0, 0), (40, 0)])}  # lifted by UP_M, walk and all
-TWO_POINTS = {"two_points": (town_of(((10, 9, 5), (2, 2, 5))), [(0, 0), (0.7, 0)])}
-ALL = WORLDS | ON_A_HILL | TWO_POINTS
+ALL = WORLDS | ON_A_HILL | {"two_points": (town_of(((10, 9, 5), (2, 2, 5))), [(0, 0), (0.7, 0)])}
 # Straight through the middle of a block: repair of what knows no way round it does not come to an end.
 NOT_REPAIRED = {("minimum_jerk", "corner"), ("trajopt", "corner")}
 
