@@ -41,6 +41,7 @@ def serving(box_map: BoxMap, folder: Path, *faults: str, protocol: str = "carla"
 
 @contextlib.contextmanager
 def listening(words: list[str]) -> Iterator[None]:
+    """Start a server, and see in the end that each of its planted faults has come true."""
     process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
@@ -48,7 +49,8 @@ def listening(words: list[str]) -> Iterator[None]:
         yield
     finally:
         process.kill()
-        process.wait()
+        told, _ = process.communicate()
+    assert {*words[words.index("--port") + 3 :]} <= {*told.splitlines()}
 
 
 def as_client(function: Callable[..., Any], *arguments: Any) -> Any:

@@ -33,7 +33,8 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.formats.playback import Perturbation, TargetRecord, Track
 from cosfly.formats.playback_file import write_track
-from cosfly.geometry.axes import DT_S, box_corners, intrinsic_matrix, look_at, project, world_from_camera
+from cosfly.geometry.axes import DT_S, intrinsic_matrix, look_at, world_from_camera
+from cosfly.render.camera import view_target
 
 PERSON_ID = 0x1234  # two different bytes, so that a swap of the channels shows
 FIRST_SECOND = 1_776_047_127
@@ -108,16 +109,13 @@ def make_flight(
     # A shifted camera is aimed anew, as the renderer aims it.
     rotations[:, :2] += np.degrees(np.subtract(look_at(positions, targets), aimed_before).T)
     camera = Camera(width_px, height_px, intrinsic_matrix(width_px, height_px, 60.0))
-    views = [_annotate(scene, targets[i], positions[i], rotations[i], camera) for i in range(num_points)]
-    bbox = np.array([view[0] for view in views])
-    visibility = np.array([view[3] for view in views])
+    seen = seen_by(camera, positions, rotations, targets)
+    shares = [_visible_share(scene, target, position) for target, position in zip(targets, positions, strict=True)]
+    visibility = np.where(seen["in_view"], shares, 0.0)
     flight = Track(
         town=town, trajectory=trajectory, variant=variant, camera=camera, time_s=np.arange(num_points) * DT_S,
         positions_m=positions, rotations_deg=rotations, targets_m=targets,
-        target=TargetRecord(
-            in_view=~np.isnan(bbox[:, 0]), visible=visibility >= 0.3, depth_m=np.array([view[2] for view in views]),
-            uv=np.array([view[1] for view in views]), bbox=bbox, visibility=visibility,
-        ),
+        target=TargetRecord(**seen, visible=visibility >= 0.3, visibility=visibility),
         perturbation=Perturbation(np.full(num_points, variant != "ORI"), drone_offsets, rotation_offsets, zero.copy()),
         source={
             "path_index": seed, "scenario_id": f"specimen_{seed}", "scenario_name": "specimen", "algorithm": "muco",
@@ -125,6 +123,16 @@ def make_flight(
         is_original=variant == "ORI",
     )  # fmt: skip
     return flight, scene
+
+
+def seen_by(camera: Camera, positions_m: np.ndarray, rotations_deg: np.ndarray, targets_m: np.ndarray) -> dict:
+    """Give what a target record says of the view of a camera."""
+    poses = map(world_from_camera, positions_m, rotations_deg)
+    views = [view_target(target_m, pose, camera) for target_m, pose in zip(targets_m, poses, strict=True)]
+    in_view = np.array([view.in_view for view in views])
+    uv = np.where(in_view[:, None], [view.uv for view in views], np.nan)
+    columns = {"depth_m": [view.depth_m for view in views], "bbox": [view.bbox_px for view in views]}
+    return {"in_view": in_view, "uv": uv, **{name: np.array(values) for name, values in columns.items()}}
 
 
 def _walk(num_points: int, rng: np.random.Generator) -> np.ndarray:
@@ -166,36 +174,16 @@ def _follow(targets: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, 
 def _scene(targets: np.ndarray, positions: np.ndarray, rng: np.random.Generator) -> Scene:
     """A few buildings beside the walk and one wall that hides the person for some frames in the middle of the
     flight."""
-    centers, halves, colors, kinds = [], [], [], []
+    rows, middle, k = [], targets[len(targets) // 2], int(0.6 * len(targets))
     for _ in range(6):
         angle, distance_m = rng.uniform(-np.pi, np.pi), rng.uniform(25.0, 45.0)
-        half = np.array([rng.uniform(3.0, 7.0), rng.uniform(3.0, 7.0), rng.uniform(3.0, 9.0)])
-        middle = targets[len(targets) // 2]
-        centers.append([middle[0] + distance_m * np.cos(angle), middle[1] + distance_m * np.sin(angle), half[2]])
-        halves.append(half)
-        colors.append(rng.integers(90, 200, 3))
-        kinds.append(KINDS["Buildings"])
-    k = int(0.6 * len(targets))
+        half = [rng.uniform(3.0, 7.0), rng.uniform(3.0, 7.0), rng.uniform(3.0, 9.0)]
+        center = [middle[0] + distance_m * np.cos(angle), middle[1] + distance_m * np.sin(angle), half[2]]
+        rows.append((center, half, rng.integers(90, 200, 3), KINDS["Buildings"]))
     between = targets[k, :2] + 0.12 * (positions[k, :2] - targets[k, :2])
-    centers.append([*between, 1.5])
-    halves.append(np.array([0.6, 0.6, 1.5]))
-    colors.append(np.array([120, 110, 100]))
-    kinds.append(KINDS["Walls"])
-    ids = np.arange(1, len(centers) + 1)
-    return Scene(np.array(centers), np.array(halves), np.array(colors, np.uint8), np.array(kinds), ids)
-
-
-def _annotate(scene: Scene, target: np.ndarray, position: np.ndarray, rotation: np.ndarray, camera: Camera) -> tuple:
-    """Give bbox (4,), uv (2,), z-depth and visibility of the person; NaN where out of view."""
-    pose = world_from_camera(position, rotation)
-    uv, depth = project(target[None], pose, camera.intrinsic)
-    corners, _ = project(box_corners(target, np.array(PERSON_HALF_EXTENTS_M)), pose, camera.intrinsic)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    size = np.array([camera.width_px, camera.height_px])
-    if not (np.isfinite(corners).all() and (high > 0).all() and (low < size).all()):
-        return np.full(4, np.nan), np.full(2, np.nan), float(depth[0]), 0.0
-    box = np.concatenate([np.clip(low, 0, size), np.clip(high, 0, size)])
-    return box, uv[0], float(depth[0]), _visible_share(scene, target, position)
+    rows.append(([*between, 1.5], [0.6, 0.6, 1.5], np.array([120, 110, 100]), KINDS["Walls"]))
+    centers, halves, colors, kinds = map(np.array, zip(*rows, strict=True))
+    return Scene(centers, halves, colors.astype(np.uint8), kinds, np.arange(1, len(rows) + 1))
 
 
 def _visible_share(scene: Scene, target: np.ndarray, position: np.ndarray) -> float:

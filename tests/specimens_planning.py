@@ -15,7 +15,7 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory, walk_id, write
 from cosfly.formats.playback import Perturbation, TargetRecord, Track
 from cosfly.formats.traces import DroneTrace
 from cosfly.geometry import kernels
-from cosfly.geometry.axes import DT_S, intrinsic_matrix, world_from_camera
+from cosfly.geometry.axes import DT_S, intrinsic_matrix
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import WalkableGround, walkable_ground
@@ -23,11 +23,10 @@ from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.muco.loss import evaluate, make_state
 from cosfly.planners.stage import draw_styles_of, make_scenario, plan_trajectory, screens_of
-from cosfly.render.camera import view_target
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import simplify
-from specimens import make_flight, map_of
+from specimens import make_flight, map_of, seen_by
 
 
 def walk_along(path_id, corners, speed_mps=1.2, dt_s=DT_S):
@@ -121,14 +120,9 @@ def town_flights(town: RunConfig, paces: Sequence[str | None]) -> Iterator[Drone
 def track_of(trace: DroneTrace, size_px: tuple[int, int], fov_deg: float) -> Track:
     """Return the clean track of a trajectory, without pictures."""
     camera = Camera(*size_px, intrinsic_matrix(*size_px, fov_deg))
-    matrices = [world_from_camera(*pose) for pose in zip(trace.positions_m, trace.rotations_deg, strict=True)]
-    views = [view_target(at_m, pose, camera) for at_m, pose in zip(trace.targets_m, matrices, strict=True)]
-    in_view = np.array([view.in_view for view in views])
-    target = TargetRecord(
-        in_view=in_view, visible=in_view & (trace.visibility > 0), depth_m=np.array([view.depth_m for view in views]),
-        uv=np.array([view.uv for view in views]), bbox=np.array([view.bbox_px for view in views]),
-        visibility=trace.visibility,
-    )  # fmt: skip
+    seen = seen_by(camera, trace.positions_m, trace.rotations_deg, trace.targets_m)
+    visible = seen["in_view"] & (trace.visibility > 0)
+    target = TargetRecord(**seen, visible=visible, visibility=trace.visibility)
     zero = np.zeros((len(trace.time_s), 3))
     return replace(
         make_flight(len(trace.time_s))[0], folder=Path(), camera=camera, time_s=trace.time_s,

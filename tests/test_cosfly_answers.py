@@ -210,7 +210,6 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("any model: curly quotes in a text", changed(reasoning_trace="The “person” keeps to the middle of the image."),
         "The “person” keeps to the middle of the image."),
     ("any model: an escape that is none", TEXT.replace("person", "\\person"), "broken_json"),
-    ("JavaScript habits: camel case", TEXT.replace("flight_decision", "flightDecision"), "missing_field"),
     ("small models: a key twice", TEXT[:-1] + ', "flight_decision": "hover"}', "duplicate_key"),
     ("small models: a key twice in a draft", f'{DRAFT[:-1]}, "flight_decision": "ascend"}}\n{TEXT}', (PROSE,)),
     ("vLLM 0.26, a random model: raw control characters", TEXT.replace("walks", "wal\x0fks"), ("control_characters",)),
@@ -219,7 +218,6 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("any server", "", "empty"),
     ("any model refuses", "I'm sorry, but I can't help with that.", "no_json_object"),
     ("any model: a list", '["hover"]', "no_json_object"),
-    ("any server: cut off in a text", HALF, "broken_json"),
     ("any model: a draft, then cut off", f"{DRAFT}\nNo: {HALF}", "broken_json"),
     ("any model: quotes in a text", TEXT.replace("person", 'person "in red"'), "broken_json"),
     ("numpy habits: NaN", TEXT[:-1] + ', "claims": [NaN]}', "not_finite"),
@@ -246,23 +244,10 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
 ]  # fmt: skip
 
 
-def test_texts(subtests):
-    for name, text, outcome in TEXTS:
-        with subtests.test(name=name):
-            parsed = parse_answer(text)
-            if isinstance(outcome, tuple):
-                assert parsed.coc == Coc(**GOOD) or "control_characters" in outcome, parsed
-                assert parsed.recovered == outcome
-            elif parsed.coc is None:
-                assert parsed.reason == outcome
-            else:
-                assert parsed.coc.reasoning_trace == outcome
-
-
-# The same of Chinese answers; None: the object as it stands.
-CHINESE_TEXTS: list[tuple[str, str, str | None]] = [
-    ("any model", ZH, None),
-    ("Qwen: Chinese prose round it", f"好的，以下是翻译结果：\n```json\n{ZH}\n```\n希望对您有帮助！", None),
+# The same of Chinese answers.
+CHINESE_TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
+    ("any model", ZH, ()),
+    ("Qwen: Chinese prose round it", f"好的，以下是翻译结果：\n```json\n{ZH}\n```\n希望对您有帮助！", (FENCE, PROSE)),
     ("any model: English for Chinese", TEXT, "critical_components_wrong_language"),
     ("small models: one field left in English", json.dumps(CHINESE | {"reasoning_trace": GOOD["reasoning_trace"]}),
         "reasoning_trace_wrong_language"),
@@ -272,14 +257,18 @@ CHINESE_TEXTS: list[tuple[str, str, str | None]] = [
 ]  # fmt: skip
 
 
-def test_chinese_texts():
-    for text, outcome in [case[1:] for case in CHINESE_TEXTS]:
-        parsed = parse_answer(text, "zh")
-        if parsed.coc is None:
-            assert parsed.reason == outcome
-        else:
-            assert parsed.coc.reasoning_trace == (outcome or CHINESE["reasoning_trace"])
-            assert outcome or parsed.coc == Coc(**CHINESE)
+@pytest.mark.parametrize(("language", "cases", "whole"), [("en", TEXTS, GOOD), ("zh", CHINESE_TEXTS, CHINESE)])
+def test_texts(language, cases, whole, subtests):
+    for name, text, outcome in cases:
+        with subtests.test(name=name):
+            parsed = parse_answer(text, language)
+            if isinstance(outcome, tuple):
+                assert parsed.coc == Coc(**whole) or "control_characters" in outcome, parsed
+                assert parsed.recovered == outcome
+            elif parsed.coc is None:
+                assert parsed.reason == outcome
+            else:
+                assert parsed.coc.reasoning_trace == outcome
 
 
 # How decisions are spelled; what they are read as.
@@ -413,9 +402,6 @@ def test_a_refusal_is_read_as_what_it_means():
     for body in REFUSAL_BODIES.values():
         for server, status, kind, text in REFUSALS:
             assert kind_of(int(status), body(text, int(status))) == kind, server
-
-
-def test_every_meaning_is_in_the_table_and_every_server_once():
     assert {kind for _, _, kind, _ in REFUSALS} == set(MEANINGS)
     assert len({server for server, *_ in REFUSALS}) == len(REFUSALS)
 

@@ -18,8 +18,6 @@ from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.json_io import write_json
 from cosfly.runtime.run_dir import Dropped, Kept, StageFolder, Tally
 
-ROOT = Path(__file__).resolve().parents[1]
-
 
 @pytest.fixture(autouse=True)
 def _own_log():

@@ -1,5 +1,6 @@
 """Ground: derived where a map has buildings and no streets; made flat where it slopes."""
 
+import itertools
 import json
 import re
 from pathlib import Path
@@ -30,60 +31,41 @@ def city_height_m(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return CITY_LOW_M + 18.0 * across + 0.6 * np.sin(x / 30.0)
 
 
-class _Vertices:
-    def __init__(self) -> None:
-        self.rows: list[list[int]] = []
+def sloped_city() -> dict:
+    """A CityJSON 2.0 quarter of sixteen houses, three streets and a wall on the slope."""
+    vertices: list[list[int]] = []
+    objects = {}
 
-    def add(self, x: float, y: float, z: float) -> int:
-        self.rows.append([round(1000 * x), round(1000 * y), round(1000 * z)])
-        return len(self.rows) - 1
+    def add(*corners: tuple[float, float, float]) -> list[int]:
+        vertices.extend([round(1000 * float(part)) for part in corner] for corner in corners)
+        return list(range(len(vertices) - len(corners), len(vertices)))
 
-    def sheet(self, low: tuple[float, float], high: tuple[float, float], step_m: float, above_m: float = 0.0) -> list:
-        xs, ys = (np.linspace(low[k], high[k], max(2, round((high[k] - low[k]) / step_m) + 1)) for k in (0, 1))
-        number = np.array([[self.add(x, y, float(city_height_m(x, y)) + above_m) for x in xs] for y in ys])
-        a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
-        return [
-            [[int(k) for k in t]]
-            for three in ((a, b, c), (a, c, d))
-            for t in zip(*(v.ravel() for v in three), strict=True)
-        ]
+    def add_sheet(name, kind, low, high, step_m, above_m=0.0, **attributes) -> None:
+        """A surface along the ground."""
+        xs, ys = (np.linspace(a, b, max(2, round((b - a) / step_m) + 1)) for a, b in zip(low, high, strict=True))
+        faces = []
+        for (x0, x1), (y0, y1) in itertools.product(itertools.pairwise(xs), itertools.pairwise(ys)):
+            places = (x0, y0), (x1, y0), (x1, y1), (x0, y1)
+            a, b, c, d = add(*((*place, city_height_m(*place) + above_m) for place in places))
+            faces += [[[a, b, c]], [[a, c, d]]]
+        sheet = {"type": "MultiSurface", "lod": "1", "boundaries": faces}
+        objects[name] = {"type": kind, "attributes": attributes, "geometry": [sheet]}
 
-    def house(self, x: float, y: float, size: tuple[float, float], height: float) -> list:
-        """The outer shell of a flat-roofed house that stands on its lowest foot."""
-        corners = [(x, y), (x + size[0], y), (x + size[0], y + size[1]), (x, y + size[1])]
-        foot = min(float(city_height_m(*corner)) for corner in corners)
-        k = [self.add(*corner, z) for z in (foot, foot + height) for corner in corners]
+    for row, column in np.ndindex(4, 4):
+        x, y = 20.0 + 55.0 * column, 15.0 + 45.0 * row
+        corners = [(x, y), (x + 30.0, y), (x + 30.0, y + 22.0), (x, y + 22.0)]
+        foot_m = min(city_height_m(*corner) for corner in corners)  # a flat-roofed house on its lowest foot
+        top_m = foot_m + 9.0 + 2.0 * ((row + column) % 3)
+        k = add(*((*corner, z) for z in (foot_m, top_m) for corner in corners))
         faces = ([3, 2, 1, 0], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7])
-        return [[[k[i] for i in face]] for face in faces]
-
-
-def sloped_city(*, terrain: bool = True, streets: bool = True) -> dict:
-    """A CityJSON 2.0 quarter of sixteen houses on the slope; without terrain and streets only feet tell of it."""
-    vertices, objects = _Vertices(), {}
-    for row in range(4):
-        for column in range(4):
-            shell = vertices.house(
-                20.0 + 55.0 * column, 15.0 + 45.0 * row, (30.0, 22.0), 9.0 + 2.0 * ((row + column) % 3)
-            )
-            solid = {"type": "Solid", "lod": "1.2", "boundaries": [shell]}
-            objects[f"house {row} {column}"] = {"type": "Building", "geometry": [solid]}
-    if terrain:
-        sheet = {"type": "CompositeSurface", "lod": "1", "boundaries": vertices.sheet((0.0, 0.0), CITY_SIZE_M, 10.0)}
-        objects["terrain"] = {"type": "TINRelief", "geometry": [sheet]}
-    for row in range(3 if streets else 0):
-        y = 43.0 + 45.0 * row
-        sheet = {
-            "type": "MultiSurface", "lod": "1", "boundaries": vertices.sheet((0.0, y), (CITY_SIZE_M[0], y + 8.0), 8.0),
-        }  # fmt: skip
-        objects[f"street {row}"] = {"type": "Road", "geometry": [sheet]}
-    if streets:
-        wall = vertices.sheet((5.0, 20.0), (5.6, 180.0), 5.0, above_m=1.5)
-        objects["wall"] = {
-            "type": "GenericCityObject", "attributes": {"bgt_type": "muur"},
-            "geometry": [{"type": "MultiSurface", "lod": "1", "boundaries": wall}],
-        }  # fmt: skip
+        solid = {"type": "Solid", "lod": "1.2", "boundaries": [[[[k[i] for i in face]] for face in faces]]}
+        objects[f"house {row} {column}"] = {"type": "Building", "geometry": [solid]}
+    add_sheet("terrain", "TINRelief", (0.0, 0.0), CITY_SIZE_M, 10.0)
+    for row in range(3):
+        add_sheet(f"street {row}", "Road", (0.0, 43.0 + 45.0 * row), (CITY_SIZE_M[0], 51.0 + 45.0 * row), 8.0)
+    add_sheet("wall", "GenericCityObject", (5.0, 20.0), (5.6, 180.0), 5.0, 1.5, bgt_type="muur")
     return {
-        "type": "CityJSON", "version": "2.0", "vertices": vertices.rows, "CityObjects": objects,
+        "type": "CityJSON", "version": "2.0", "vertices": vertices, "CityObjects": objects,
         "transform": {"scale": [0.001] * 3, "translate": [CITY_EAST_M, CITY_NORTH_M, 0.0]},
     }  # fmt: skip
 
@@ -120,14 +102,16 @@ def test_pavement_lies_along_facades_asphalt_between_near_buildings_and_lawn_els
 
 def test_a_city_model_without_streets_gets_it_and_the_same_bytes_twice(tmp_path: Path):
     path = tmp_path / "city.json"
-    path.write_text(json.dumps(sloped_city(terrain=False, streets=False)))
+    model = sloped_city()
+    of_houses = {name: item for name, item in model["CityObjects"].items() if item["type"] == "Building"}
+    path.write_text(json.dumps(model | {"CityObjects": of_houses}))
     cfg = MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=path, credits="Its makers."))
     first, second = (run(cfg, tmp_path / name) for name in ("one", "two"))
     assert first.read_bytes() == second.read_bytes()
     header = read_boxes(first).header
     assert header.derived_ground > 16
     assert header.credits == f"Its makers. {CREDITS}"
-    path.write_text(json.dumps(sloped_city()))
+    path.write_text(json.dumps(model))
     assert load_map(cfg).header.derived_ground == 0
 
 

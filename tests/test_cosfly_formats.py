@@ -14,7 +14,6 @@ from cosfly.formats.episodes import Episode, EpisodeFrame, episode_file, read_ep
 from cosfly.formats.frames import PERSON_ID
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths, write_paths
 from cosfly.formats.people import GOAL_TERMS, Appearance, Goal, People, read_goal
-from cosfly.formats.roi import read_roi
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
 from cosfly.geometry.goals import SIDES, SLOTS, SeenFrame, find_says, meant, words_of
 from cosfly.render.person import choose_appearance, choose_look_alike
@@ -65,15 +64,6 @@ def test_fields_of_a_map_that_contradict_each_other_are_named(tmp_path, change, 
         read_boxes(tmp_path / "boxes_3d.json")
 
 
-def test_roi_forms(tmp_path):
-    path = tmp_path / "roi_polygon.json"
-    square = [[0, 0], [10, 0], [10, 10]]
-    path.write_text(json.dumps({"description": "d", "closed": True, "points_world": square}))
-    assert len(read_roi(path).rings()) == 1
-    path.write_text(json.dumps({"polygons": [{"points_world": square, "holes": [square]}, {"points_world": square}]}))
-    assert [len(p.holes) for p in read_roi(path).rings()] == [1, 0]
-
-
 T_S = np.arange(4) * 0.5
 
 
@@ -87,20 +77,16 @@ def a_trace():
     return DroneTrace("path_00000", "muco", T_S, m, m, m, np.ones(4), np.full(4, 5.0), {"a": 1.0}, {"b": 2}, None)
 
 
+@pytest.mark.parametrize("pace", ["walk", "hurry"])
 @pytest.mark.parametrize(
     ("write", "read", "make", "group"),
-    [
-        (write_paths, read_paths, a_path, "paths"),
-        (write_traces, read_traces, a_trace, "traces"),
-        (write_paths, read_paths, lambda: replace(a_path(), pace="hurry"), "paths"),
-        (write_traces, read_traces, lambda: replace(a_trace(), pace="hurry"), "traces"),
-    ],
+    [(write_paths, read_paths, a_path, "paths"), (write_traces, read_traces, a_trace, "traces")],
 )
-def test_path_and_trace_round_trip(tmp_path, write, read, make, group):
-    path = tmp_path / "p.json"
-    write(path, [make()], {"map": "T", "seed": 0})
+def test_path_and_trace_round_trip(tmp_path, write, read, make, group, pace):
+    path, one = tmp_path / "p.json", replace(make(), pace=pace)
+    write(path, [one], {"map": "T", "seed": 0})
     back = read(path)[0]
-    for name, value in vars(make()).items():
+    for name, value in vars(one).items():
         if isinstance(value, np.ndarray):
             assert_allclose(getattr(back, name), value)
         else:
@@ -110,7 +96,7 @@ def test_path_and_trace_round_trip(tmp_path, write, read, make, group):
         (lambda one: one["t"].__setitem__(1, one["t"][0]), r"t: the times do not increase; got 0 s, th"),
         (lambda record: record.get("target", record)["y"].__setitem__(1, 1e9), r".*y: a place is too far from"),
     ):
-        write(path, [make()], {})
+        write(path, [one], {})
         change_json(path, lambda value, change=change, group=group: change(value[group][0]))
         with pytest.raises(InputError, match=rf"{group}\[0\].*{words}"):
             read(path)

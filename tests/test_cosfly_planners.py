@@ -1,5 +1,6 @@
 """MuCO's terms and the pedestrians' search against plain versions, whole flights over hand-made maps, the plan stage."""
 
+import itertools
 import json
 from dataclasses import replace
 
@@ -9,16 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
-from specimens_planning import (
-    CANYON,
-    WORLDS,
-    assert_safe,
-    scenario_of,
-    solved_by_scipy,
-    town_of,
-    walk_along,
-    written,
-)
+from specimens_planning import CANYON, WORLDS, assert_safe, scenario_of, solved_by_scipy, town_of, walk_along, written
 
 import cosfly.planners.stage as planners
 from cosfly.formats.traces import read_traces
@@ -103,7 +95,7 @@ def test_gradient_is_the_derivative_of_the_loss():
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_the_loss_never_rises_and_the_flight_is_safe(world):
+def test_the_loss_never_rises_to_near_that_of_a_general_solver_and_the_flight_is_safe(world):
     scenario, obstacles = scenario_of(world)
     problem = muco.make_problem(scenario, CFG)
     first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
@@ -116,16 +108,8 @@ def test_the_loss_never_rises_and_the_flight_is_safe(world):
     if len(points) > 20:
         assert history[-1] < 0.8 * history[0]
     np.testing.assert_array_equal(points[[0, -1]], first[[0, -1]])
-
-
-@pytest.mark.parametrize("world", ["corner", "tower_midway"])
-def test_the_end_is_within_five_percent_of_a_general_solver(world):
-    scenario, obstacles = scenario_of(world)
-    problem = muco.make_problem(scenario, CFG)
-    first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
-    _, solver, _ = muco.optimize(first, problem, obstacles, CFG.muco)
-    general = solved_by_scipy(first, problem, obstacles, maxiter=400, maxfun=800)
-    assert solver["loss_end"] <= 1.05 * general.fun
+    if world in ("corner", "tower_midway"):
+        assert history[-1] <= 1.05 * solved_by_scipy(first, problem, obstacles, maxiter=400, maxfun=800).fun
 
 
 @pytest.mark.parametrize("name", ["five_ray_mean", "accel_rms_mps2", "jerk_rms_mps3"])
@@ -204,17 +188,13 @@ def test_a_flight_is_planned_on_from_a_place_and_a_velocity(place_m, velocity_mp
 
 
 def shortest_costs(free: np.ndarray, start: tuple[int, int], classes: np.ndarray, costs: np.ndarray) -> np.ndarray:
-    num_y, num_x = free.shape
-    rows, columns, weights = [], [], []
-    for y in range(num_y):
-        for x in range(num_x):
-            for dx, dy in ((1, 0), (0, 1), (1, 1), (-1, 1)):
-                a, b = x + dx, y + dy
-                if not (0 <= a < num_x and 0 <= b < num_y and free[y, x] and free[b, a] and free[y, a] and free[b, x]):
-                    continue
-                rows.append(y * num_x + x)
-                columns.append(b * num_x + a)
-                weights.append(np.hypot(dx, dy) * (costs[classes[y, x]] + costs[classes[b, a]]) / 2)
+    (num_y, num_x), edges = free.shape, []
+    for (y, x), (dx, dy) in itertools.product(np.ndindex(free.shape), ((1, 0), (0, 1), (1, 1), (-1, 1))):
+        a, b = x + dx, y + dy
+        if 0 <= a < num_x and b < num_y and free[y, x] and free[b, a] and free[y, a] and free[b, x]:
+            cost = np.hypot(dx, dy) * (costs[classes[y, x]] + costs[classes[b, a]]) / 2
+            edges.append((y * num_x + x, b * num_x + a, cost))
+    rows, columns, weights = np.array(edges).reshape(-1, 3).T
     graph = coo_matrix((weights, (rows, columns)), shape=(free.size, free.size)).tocsr()
     return dijkstra(graph, directed=False, indices=start[1] * num_x + start[0]).reshape(free.shape)
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from crashes import contents, differences
@@ -28,47 +29,27 @@ ray = pytest.importorskip("ray")
 os.environ |= ENVIRONMENT
 
 
-class Nodes:
-    """A cluster of processes on this machine, of a head that does no work and nodes of one CPU."""
-
-    def __init__(self) -> None:
-        from ray.cluster_utils import Cluster
-
-        logging.getLogger("ray").setLevel(logging.ERROR)
-        self._cluster = Cluster(
-            initialize_head=True,
-            head_node_args={"num_cpus": 0, "object_store_memory": STORE_BYTES, "include_dashboard": False},
-        )
-        self.address = self._cluster.address
-
-    def add(self, **settings):
-        return self._cluster.add_node(**{"num_cpus": 1, "object_store_memory": STORE_BYTES} | settings)
-
-    def kill(self, node) -> None:
-        self._cluster.remove_node(node, allow_graceful=False)
-
-    def end(self) -> None:
-        ray.shutdown()
-        self._cluster.shutdown()
+ROOM = {"object_store_memory": STORE_BYTES}
 
 
 @pytest.fixture
-def nodes() -> Iterator[Nodes]:
+def cluster() -> Iterator[Any]:
+    """A cluster of processes on this machine, so far of a head that does no work."""
+    from ray.cluster_utils import Cluster
+
     ray.shutdown()
-    found = Nodes()
-    yield found
-    found.end()
-
-
-def quick(nodes: Nodes) -> Watch:
-    return replace(QUICK, ray=RayConfig(address=nodes.address))
+    logging.getLogger("ray").setLevel(logging.ERROR)
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False, **ROOM})
+    yield made
+    ray.shutdown()
+    made.shutdown()
 
 
 @pytest.mark.slow
-def test_workers_that_die_and_stall_once_cost_nothing_but_time(tmp_path, nodes, caplog):
-    nodes.add(num_cpus=2)
+def test_workers_that_die_and_stall_once_cost_nothing_but_time(tmp_path, cluster, caplog):
+    cluster.add_node(num_cpus=2, **ROOM)
     kinds = ["once-stop", "once-die", "once-sleep", "nothing", "nothing"]
-    watch = quick(nodes)
+    watch = replace(QUICK, ray=RayConfig(address=cluster.address))
     finished = run_items(stage_in(tmp_path), items_of(*kinds), make_faulty, (tmp_path / "s",), workers=2, watch=watch)
     assert [record.id for record in finished.kept] == [f"i{k}" for k in range(len(kinds))]
     events = read_events(tmp_path / "s")
@@ -113,20 +94,21 @@ def kill_worker(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_has_the_bytes_of_the_local_engine_though_workers_and_nodes_are_lost(tmp_path, nodes, monkeypatch):
-    on = ("engine=ray", f"ray.address={nodes.address}")
+def test_a_run_has_the_bytes_of_the_local_engine_though_workers_and_nodes_are_lost(tmp_path, cluster, monkeypatch):
+    on = ("engine=ray", f"ray.address={cluster.address}")
     for place in ("local", "cluster"):
         (tmp_path / place).mkdir()
         monkeypatch.chdir(tmp_path / place)
         make("maps simplify" if place == "cluster" else "maps simplify pedestrians plan render inspect caption")
-    first, second, rendered = nodes.add(), nodes.add(), Path("run/render")
+    first, second = (cluster.add_node(num_cpus=1, **ROOM) for _ in range(2))
+    rendered = Path("run/render")
     make("pedestrians plan", *on)
     worker_lost = meanwhile(rendered, 1, lambda: kill_worker(rendered))
-    with worker_lost, meanwhile(rendered, 3, lambda: nodes.kill(first)):
+    with worker_lost, meanwhile(rendered, 3, lambda: cluster.remove_node(first, allow_graceful=False)):
         make("render", *on)
-    nodes.add()
+    cluster.add_node(num_cpus=1, **ROOM)
     make("inspect", *on)
-    with meanwhile(Path("run/caption"), 1, lambda: nodes.kill(second)):
+    with meanwhile(Path("run/caption"), 1, lambda: cluster.remove_node(second, allow_graceful=False)):
         make("caption", *on)
     for name, least in (("render", 1), ("caption", 0)):
         events = read_events(Path("run") / name)

@@ -24,7 +24,6 @@ from cosfly.runtime import io as files
 from cosfly.runtime.config import Config, apply_overrides, build, read_yaml
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError
 from cosfly.runtime.io import LinkedPath, inside, read_text
-from cosfly.runtime.journal import Journal
 from cosfly.runtime.run_dir import StageFolder, read_failures
 from release.record import RELEASE_FORMAT, read_record
 from specimens import make_playback_tree, png_around
@@ -94,19 +93,14 @@ def test_more_brackets_than_a_text_of_its_size_has_are_refused_before_they_are_l
         json_io.parse_json(b"[" + b"{},[]," * 9_999_999 + b"{}]")
 
 
-def _with_line(out: Path, record) -> StageFolder:
-    """A stage folder whose journal holds a line with the right checksum: whoever changes a file can change that too."""
-    stage = StageFolder.open(out, "demo", config=_Dated(), inputs={}, seed=0)
-    with Journal(stage.path / "items.jsonl") as journal:
-        journal.append(record)
-    return stage
-
-
 @pytest.mark.parametrize(
     "record", [{"id": "a"}, {"id": 3, "status": "kept"}, {"id": "a", "status": "kept", "result": 7}], ids=str
 )
 def test_a_forged_line_of_a_journal_is_an_error(tmp_path, record):
-    stage = _with_line(tmp_path / "out", record)
+    """Its checksum is right: whoever changes a file can change that too."""
+    stage = StageFolder.open(tmp_path / "out", "demo", config=_Dated(), inputs={}, seed=0)
+    with stage.journal as journal:
+        journal.append(record)
     with pytest.raises(InputError, match=r"items\.jsonl"):
         list(stage.items())
     with pytest.raises(InputError, match=r"items\.jsonl"):
@@ -216,15 +210,6 @@ def test_a_picture_is_measured_before_it_is_decoded(monkeypatch):
             png.colours_of(png_around(zlib.compress(b"\0" * 9), width, height), "x")
 
 
-DEPTH = depth_bytes(np.zeros((4, 4), np.float32))
-
-
-def _frame(tree: Path) -> Path:
-    frame = tree / "Town01/trajectory_1/ORI/frames_playback/frame_00000"
-    frame.mkdir(parents=True)
-    return frame
-
-
 def test_one_command_follows_links_and_the_next_in_this_process_does_not(tmp_path):
     tree = make_playback_tree(tmp_path / "data/tree", 1, 4, with_augmented=False)
     (picture,) = tree.rglob("frame_00001/rgb.png")
@@ -234,17 +219,10 @@ def test_one_command_follows_links_and_the_next_in_this_process_does_not(tmp_pat
     assert "leads out" in str(invoke(words).exception)
 
 
-def test_links_within_a_tree_and_to_a_tree_are_followed(tmp_path):
-    frame = _frame(tmp_path / "disk/tree")
-    (frame.parents[4] / "one.npy").write_bytes(DEPTH)
-    (frame / "depth.npy").symlink_to(frame.parents[4] / "one.npy")
-    (tmp_path / "data").symlink_to(tmp_path / "disk/tree")
-    assert read_depth(tmp_path / "data" / frame.relative_to(frame.parents[4])).shape == (4, 4)
-
-
 def _linked_flight(tree: Path, elsewhere: Path) -> Path:
-    frame = _frame(elsewhere)
-    (frame / "depth.npy").write_bytes(DEPTH)
+    frame = elsewhere / "Town01/trajectory_1/ORI/frames_playback/frame_00000"
+    frame.mkdir(parents=True)
+    (frame / "depth.npy").write_bytes(depth_bytes(np.zeros((4, 4), np.float32)))
     flight = tree / "Town01/trajectory_1/ORI"
     flight.parent.mkdir(parents=True)
     flight.symlink_to(frame.parents[1])
@@ -254,6 +232,8 @@ def _linked_flight(tree: Path, elsewhere: Path) -> Path:
 def test_a_flight_behind_a_link_is_read_inside_the_folder_of_its_tree_and_refused_outside(tmp_path):
     frame = _linked_flight(tmp_path / "data/tree", tmp_path / "data/elsewhere")
     assert read_depth(frame).shape == (4, 4)
+    (tmp_path / "linked").symlink_to(tmp_path / "data")
+    assert read_depth(tmp_path / "linked" / frame.relative_to(tmp_path / "data")).shape == (4, 4)
     (frame / "depth.npy").rename(tmp_path / "data/private.npy")
     (frame / "depth.npy").symlink_to(tmp_path / "data/private.npy")
     with pytest.raises(InputError, match="leads out"):

@@ -105,26 +105,15 @@ def test_look_alikes_differ_from_the_target_in_one_thing_and_nobody_looks_just_l
     assert different[1::2].max() > 1
 
 
-def blank_frame(depth: np.ndarray) -> Frame:
-    return Frame(
-        np.zeros((*depth.shape, 3), np.uint8), depth.astype(np.float32), np.zeros(depth.shape, np.uint8),
-        np.zeros(depth.shape, np.uint16),
-    )  # fmt: skip
-
-
-def test_rendered_visibility_by_hand():
+def test_half_a_person_is_seen_behind_a_corner_and_nobody_hides_himself():
     hip = np.array([0.0, 10.0, 0.9])
-    pose = pose_towards((0, 0, 0.9), hip)
+    pose, ids = pose_towards((0, 0, 0.9), hip), np.zeros((180, 320), np.uint16)
     view = view_target(hip, pose, CAMERA)
-    free = np.full((180, 320), 500.0)
-    assert rendered_visibility(blank_frame(free), hip, view, pose, CAMERA)[0] == 1.0
-    assert rendered_visibility(blank_frame(np.full((180, 320), 5.0)), hip, view, pose, CAMERA)[0] == 0.0
-    half = free.copy()
-    half[:, :160] = 5.0
-    assert rendered_visibility(blank_frame(half), hip, view, pose, CAMERA)[0] == pytest.approx(0.5, abs=0.03)
-    drawn = blank_frame(half)
-    drawn.ids[:, :160] = PERSON_ID
-    assert rendered_visibility(drawn, hip, view, pose, CAMERA) == (1.0, 0.0, 0.0), "it does not hide itself"
+    depth = np.where(np.arange(320) < 160, np.float32(5.0), np.float32(500.0)) + np.zeros((180, 1), np.float32)
+    frame = Frame(np.zeros((180, 320, 3), np.uint8), depth, ids.astype(np.uint8), ids)
+    assert rendered_visibility(frame, hip, view, pose, CAMERA)[0] == pytest.approx(0.5, abs=0.03)
+    frame.ids[:, :160] = PERSON_ID
+    assert rendered_visibility(frame, hip, view, pose, CAMERA) == (1.0, 0.0, 0.0)
 
 
 def planned(n: int = 200, box_map=None) -> Poses:
@@ -142,10 +131,11 @@ def shaken(before: Poses, box_map: BoxMap, cfg: PerturbationConfig, seed: int = 
     return perturb(before, cameras, Surroundings(box_map), cfg, np.random.default_rng(seed))
 
 
+@pytest.mark.parametrize(("correlation_s", "num"), [(0.0, 200), (6.0, 4000)])
 @pytest.mark.parametrize("sampling", ["cubic", "spherical"])
-def test_perturbed_frames_keep_their_promises(sampling):
-    cfg = PerturbationConfig(sampling=sampling)
-    before, after = planned(), perturbed(cfg)
+def test_perturbed_frames_keep_their_promises(sampling, correlation_s, num):
+    cfg = PerturbationConfig(sampling=sampling, correlation_s=correlation_s)
+    before, after = planned(num), perturbed(cfg, num)
     index = obstacle_index(street())
     moved = np.array([s["position"] == "applied" for s in after.states])
     turned = np.array([s["rotation"] == "applied" for s in after.states])
@@ -158,7 +148,7 @@ def test_perturbed_frames_keep_their_promises(sampling):
     people, _ = signed_distances(index, after.poses.targets_m[moved])
     assert people.min() >= 0.3
     assert np.abs(after.rotation_offsets_deg).max() <= cfg.max_view_deg + 1e-9
-    rolled = perturbed(PerturbationConfig(sampling=sampling, max_roll_deg=4.0))
+    rolled = perturbed(cfg.model_copy(update={"max_roll_deg": 4.0}), num)
     np.testing.assert_array_equal(rolled.rotation_offsets_deg[:, :2], after.rotation_offsets_deg[:, :2])
     np.testing.assert_array_equal(rolled.poses.rotations_deg[:, 2], rolled.rotation_offsets_deg[:, 2])
     assert not after.rotation_offsets_deg[:, 2].any()
@@ -179,16 +169,11 @@ def test_perturbed_frames_keep_their_promises(sampling):
 
 
 @pytest.mark.parametrize("sampling", ["cubic", "spherical"])
-def test_smooth_perturbations_keep_probabilities_and_radii_and_move_as_a_drone_and_a_walker_could(sampling):
-    cfg = PerturbationConfig(sampling=sampling, correlation_s=6.0, max_roll_deg=4.0)
-    n, dt_s = 4000, 0.5
-    before, after = planned(n), perturbed(cfg, n)
+def test_smooth_perturbations_keep_probabilities_and_move_as_a_drone_and_a_walker_could(sampling):
+    cfg, dt_s = PerturbationConfig(sampling=sampling, correlation_s=6.0), 0.5
+    after = perturbed(cfg, 4000)
     drawn = np.array([[state["position"] != "none", state["rotation"] != "none"] for state in after.states])
     np.testing.assert_allclose(drawn.mean(axis=0), [0.6, 0.6], atol=0.1)
-    applied = np.array([state["position"] == "applied" for state in after.states])
-    assert applied.mean() > 0.3
-    assert not after.drone_offsets_m[~applied].any()
-    assert not after.target_offsets_m[~applied].any()
     order = None if sampling == "spherical" else np.inf
     for offsets_m, radius_m in (
         (after.drone_offsets_m, cfg.drone_radius_m), (after.target_offsets_m[:, :2], cfg.pedestrian_radius_m)
@@ -199,9 +184,6 @@ def test_smooth_perturbations_keep_probabilities_and_radii_and_move_as_a_drone_a
         accelerations_mps2 = np.linalg.norm(np.diff(steps, axis=0), axis=1) / dt_s**2
         assert speeds_mps.max() < 2.5
         assert np.percentile(accelerations_mps2, 95) < 1.5
-    assert 2.0 < np.abs(after.rotation_offsets_deg[:, 2]).max() <= 4.0
-    assert np.abs(after.rotation_offsets_deg).max() <= cfg.max_view_deg
-    np.testing.assert_allclose(after.poses.positions_m - before.positions_m, after.drone_offsets_m)
 
 
 def test_a_smooth_perturbation_fades_before_it_falls_back():
@@ -265,17 +247,11 @@ def test_a_whole_flight_along_a_planted_wall_keeps_the_planners_clearance(gap_m,
     assert (careless.poses.clearances_m.min() < 2.5) == (gap_m < 6.0), "or the wall would prove nothing"
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("render")
-    traces = [circling(5), circling(5, "path_001", "not_visible"), circling(4, "path_002")]
-    inputs = write_inputs(folder / "in", traces)
-    return run(build(RenderConfig, SMALL, "test"), *inputs, folder / "out", seed=5), inputs
-
-
-def test_the_tree_is_complete_and_readable_and_shows_what_its_annotation_says(finished, tmp_path):
+def test_the_tree_is_complete_and_readable_and_shows_what_its_annotation_says(tmp_path):
     """The inspection checks files, digests, masks, depths and boxes against poses."""
-    tree, (_, simplified, traces) = finished
+    flights = [circling(5), circling(5, "path_001", "not_visible"), circling(4, "path_002")]
+    boxes, simplified, traces = write_inputs(tmp_path / "in", flights)
+    tree = run(build(RenderConfig, SMALL, "test"), boxes, simplified, traces, tmp_path / "out", seed=5)
     assert len(read_public(tree)) == 2  # the strictest public reader
     folders = find_tracks(tree)
     names = [str(f.relative_to(tree)) for f in folders]

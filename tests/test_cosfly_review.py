@@ -23,8 +23,6 @@ from cosfly.runtime.io import sha256_file
 from release.build.sources import Source, gather
 from specimens import make_flight, make_playback_tree
 
-QUEUE = CFG.model_copy(update={"smoothness_min": 1.0})  # the plan of every flight is less smooth than that
-
 
 @pytest.fixture(scope="module")
 def inspected(tmp_path_factory) -> Path:
@@ -32,7 +30,8 @@ def inspected(tmp_path_factory) -> Path:
     tree = make_playback_tree(root / "tree", 2, 6, width_px=96, height_px=54)
     write_map(root)
     write_traces(root / "drone_trace.json", [plan_of(f) for f in find_tracks(tree) if f.name == "ORI"], {})
-    return run(QUEUE, root / "map.json", root / "drone_trace.json", tree, root / "inspect")
+    cfg = CFG.model_copy(update={"smoothness_min": 1.0})  # the plan of every flight is less smooth than that
+    return run(cfg, root / "map.json", root / "drone_trace.json", tree, root / "inspect")
 
 
 @pytest.fixture
@@ -62,32 +61,22 @@ def test_decisions_are_on_record_and_the_last_one_counts(product):
     assert one.sha256 == read_inspection(product).flights[1].sha256
 
 
-def test_results_and_funnel_are_those_after_review(product):
-    before = product.read_bytes()
-    flights = folders_of(product)
-    decide(product, "accepted", *flights[:3])
-    decide(product, "rejected", flights[3])
+def test_results_funnel_and_release_are_those_after_review(product, inspected):
+    before, flights = product.read_bytes(), folders_of(product)
+    source = Source("run", inspected.parent.parent / "tree", product, product)  # captions are not read here
+    take = lambda: [one.dropped for one in gather([source], include_review=False).candidates]  # noqa: E731
+    assert take() == ["review: smoothness"] * 4
+    decide(product, "accepted", *flights[:2])
+    decide(product, "rejected", flights[2])
+    assert take() == [None, None, "rejected: review", "review: smoothness"]
     settled = read_settled(product)
-    assert [flight.result for flight in settled.flights] == ["accepted"] * 3 + ["rejected"]
-    assert settled.flights[3].reason == "review"
+    assert [flight.result for flight in settled.flights] == ["accepted", "accepted", "rejected", "review"]
+    assert settled.flights[2].reason == "review"
     counts = settled.funnel.trajectories
     assert (counts.accepted, counts.review, counts.rejected) == (1, 0, 1)
     assert product.read_bytes() == before
     assert "decided" not in json.dumps(settled.model_dump(mode="json")["flights"])
-
-
-def test_the_release_takes_what_was_accepted(product, inspected, monkeypatch):
-    tree = inspected.parent.parent / "tree"
-    source = Source("run", tree, product, product)  # captions are not read here
-    take = lambda: gather([source], include_review=False)  # noqa: E731
-    assert {one.dropped for one in take().candidates} == {"review: smoothness"}
-    flights = folders_of(product)
-    decide(product, "accepted", *flights[:2])
-    decide(product, "rejected", flights[2])
-    assert [one.dropped for one in take().candidates] == [None, None, "rejected: review", "review: smoothness"]
-    assert source.files["review"] == product.with_name(REVIEW), (
-        "an input of the stage: a later decision is another input"
-    )
+    assert source.files["review"] == product.with_name(REVIEW), "an input of the stage, as a later decision is another"
 
 
 def test_the_command_decides_and_says_what_is_open(product):
@@ -115,9 +104,6 @@ def flight_of(walked_m, **changes):
     return replace(flight, targets_m=targets, positions_m=positions, perturbation=still, is_original=True, **changes)
 
 
-EVEN = np.column_stack([0.6 * np.arange(1, NUM + 1), np.zeros(NUM)])
-
-
 @given(st.integers(0, 2**31))
 @settings(max_examples=25, deadline=None)
 def test_a_past_is_the_same_wherever_and_whenever_it_was(seed):
@@ -140,7 +126,7 @@ def test_a_past_is_the_same_wherever_and_whenever_it_was(seed):
 
 def test_a_past_holds_what_a_prompt_may_tell():
     """Poses as they were drawn, with their perturbation, and no place of a target that nobody sees."""
-    clean = flight_of(EVEN)
+    clean = flight_of(np.column_stack([0.6 * np.arange(1, NUM + 1), np.zeros(NUM)]))
     shifted_m = np.zeros((NUM, 3))
     shifted_m[3] = 0.5, -0.5, 0.2
     noisy = replace(

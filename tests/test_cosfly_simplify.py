@@ -17,7 +17,6 @@ from specimens import map_of
 
 VEGETATION, BUILDINGS, STATIC, ROADS = (KINDS[name] for name in ("Vegetation", "Buildings", "Static", "Roads"))
 PASSES = ["input", "merge", "crop_tree", "crop_below_ground", "prune_nested"]
-PAPER = {"min_fill": 0.0, "min_canopy_fill": 0.0, "trunk": "full"}
 
 
 def box_map(*rows, ids=None) -> BoxMap:
@@ -28,8 +27,7 @@ def box_map(*rows, ids=None) -> BoxMap:
 
 def only(what: str, **settings_) -> SimplifyConfig:
     """Settings with one pass switched on."""
-    passes = dict.fromkeys(("merge", "crop_tree", "crop_below_ground", "prune_nested"), False)
-    return SimplifyConfig(**{**passes, what: True, **settings_})
+    return SimplifyConfig(**{**dict.fromkeys(PASSES[1:], False), what: True, **settings_})
 
 
 def random_map(seed: int, count: int, size_m: float = 30.0) -> BoxMap:
@@ -93,20 +91,14 @@ def test_the_guard_keeps_a_street_between_two_askew_rows_and_the_papers_rule_doe
     assert walkable[1] > 0.9 * cross_validate(street, street)["raw_walkable_m2"]
 
 
-def test_full_trunks_are_the_papers_split():
-    tree = box_map(("Vegetation", (0, 0, 0), (4, 6, 10)), ids=[77])
-    cropped = simplify(tree, only("crop_tree", trunk="full"))
-    assert cropped.ids.tolist() == [77, 1]
-    np.testing.assert_allclose(cropped.mins, [(0, 0, 2.5), (0, 0, 0)])
-    np.testing.assert_allclose(cropped.maxs, [(4, 6, 10.5), (4, 6, 2)])
-
-
 def test_stems_let_people_walk_below_trees():
     tree = box_map(("Vegetation", (0, 0, 0), (4, 6, 10)), ("Roads", (-9, -9, -1), (9, 9, 0)))
     stems = simplify(tree, only("crop_tree"))
     np.testing.assert_allclose(stems.maxs[2] - stems.mins[2], (0.5, 0.5, 2.0))
     np.testing.assert_allclose(stems.centers[2], (2, 3, 1))
-    full = simplify(tree, only("crop_tree", trunk="full"))
+    full = simplify(tree, only("crop_tree", trunk="full"))  # the paper's split
+    np.testing.assert_allclose(full.mins[[0, 2]], [(0, 0, 2.5), (0, 0, 0)])
+    np.testing.assert_allclose(full.maxs[[0, 2]], [(4, 6, 10.5), (4, 6, 2)])
     area = [cross_validate(tree, m)["simplified_walkable_m2"] for m in (stems, full)]
     assert area[0] > area[1] + 20.0
 
@@ -170,7 +162,8 @@ def test_nested_boxes_of_one_kind_go(inner, kind, kept):
 @given(seed=st.integers(0, 10**6), paper=st.booleans())
 def test_the_whole_keeps_its_books(seed, paper):
     boxes = random_map(seed, 80)
-    result = simplify(boxes, SimplifyConfig(**(PAPER if paper else {})))
+    of_paper = SimplifyConfig(min_fill=0.0, min_canopy_fill=0.0, trunk="full")
+    result = simplify(boxes, of_paper if paper else SimplifyConfig())
     ids = result.ids.tolist()
     assert len(set(ids)) == len(ids)
     assert [one.name for one in result.header.passes] == PASSES
@@ -187,8 +180,7 @@ def test_stage_writes_map_report_and_picture(tmp_path: Path):
     write_boxes(source, boxes)
     product = run(SimplifyConfig(), source, tmp_path / "out")
     simplified = read_boxes(product)
-    found = [p.name for p in simplified.header.passes]
-    assert found == ["input", "merge", "crop_tree", "crop_below_ground", "prune_nested"]
+    assert [p.name for p in simplified.header.passes] == PASSES
     report = json.loads((tmp_path / "out/simplify_report.json").read_text())
     assert report["num_boxes"] == {"raw": 120, "simplified": len(simplified)}
     assert report["passes"][-1]["counts"] == simplified.counts()

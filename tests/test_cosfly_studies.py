@@ -8,12 +8,7 @@ from commands import obeyed
 from test_renderers_contract import circling, write_inputs
 from toy_workers import make_counting_worker, stage_in
 
-from cosfly.pipeline.reproduce import (
-    FigureReader,
-    MissingFile,
-    rendering_figures,
-    watchdog_figures,
-)  # fmt: skip
+from cosfly.pipeline.reproduce import FigureReader, MissingFile, rendering_figures, watchdog_figures
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.events import Event, read_events
 from cosfly.runtime.journal import Journal
@@ -24,18 +19,11 @@ from cosfly.runtime.worker import Item
 from cosfly.studies.depth import study_of
 from cosfly.studies.zoom import enlarged_fov_deg
 
-NEAR_M, FAR_M = 15.36, 38.32  # tab:depth_format_comparison
-
-
-def ramp(dtype: type, shape: tuple[int, int] = (72, 128)) -> np.ndarray:
-    """Depths spread evenly over the paper's range, in an order that no row tells."""
-    values = np.linspace(NEAR_M, FAR_M, shape[0] * shape[1])
-    return np.random.default_rng(0).permutation(values).reshape(shape).astype(dtype)
-
 
 def test_depths_spread_evenly_give_the_papers_errors():
-    """Its scene is nearly so: half a step at most, a quarter of one on average; its print is within 3 % of that."""
-    rows = {row["coding"]: row for row in study_of(ramp(np.float64, (360, 640)), "ramp")[0]["rows"]}
+    """Its scene (tab:depth_format_comparison) is nearly so: half a step at most, a quarter of one on average; its print is within 3 % of that."""
+    depths_m = np.random.default_rng(0).permutation(np.linspace(15.36, 38.32, 360 * 640)).reshape(360, 640)
+    rows = {row["coding"]: row for row in study_of(depths_m, "ramp")[0]["rows"]}
     for coding, *errors_cm, psnr_db in (
         ("8-bit", 4.5019, 2.2494, 2.5979, 58.9),
         ("10-bit", 1.1222, 0.5543, 0.6418, 71.1),
@@ -49,26 +37,19 @@ def test_depths_spread_evenly_give_the_papers_errors():
         assert row["kilobytes"] == pytest.approx(kib), "as the paper's column counts them"
 
 
-LEVELS = [110.0, 60.0, 30.0]
-
-
 def test_a_longer_lens_shows_the_middle_as_large():
     longer_deg = enlarged_fov_deg(110.0, 5.0)
     assert np.tan(np.radians(longer_deg / 2)) == pytest.approx(np.tan(np.radians(55)) / 5)
 
 
 @pytest.mark.slow
-def test_the_target_grows_as_the_lens_does(tmp_path_factory, in_this_process):
-    folder = tmp_path_factory.mktemp("study")
-    boxes, simplified, traces = write_inputs(folder / "inputs", [circling(6), circling(5, "path_002")])
-    words = f"study zoom --map {boxes} --simplified {simplified} --traces {traces} --out {folder / 'out'} --every 2"
-    settings = f"render.fovs_deg={LEVELS} render.width_px=640 render.height_px=360".replace(", ", ",")
-    sets = [word for setting in settings.split() for word in ("--set", setting)]
-    obeyed(words, "--workers 0", sets)
-    out = folder / "out"
-    found = json.loads((out / "zoom_study.json").read_text())
-    levels = found["levels"]
-    assert [level["fov_deg"] for level in levels] == LEVELS
+def test_the_target_grows_as_the_lens_does(tmp_path, in_this_process):
+    boxes, simplified, traces = write_inputs(tmp_path / "inputs", [circling(6), circling(5, "path_002")])
+    words = f"study zoom --map {boxes} --simplified {simplified} --traces {traces} --out {tmp_path / 'out'} --every 2"
+    size = "--set render.width_px=640 --set render.height_px=360"
+    obeyed(words, "--workers 0 --set render.fovs_deg=[110,60,30]", size)
+    levels = json.loads((tmp_path / "out/zoom_study.json").read_text())["levels"]
+    assert [level["fov_deg"] for level in levels] == [110.0, 60.0, 30.0]
     assert [level["frames"] for level in levels] == [6, 6, 6]
     wide, _, long = levels
     factor = long["focal_length_px"] / wide["focal_length_px"]
@@ -97,11 +78,11 @@ EVENTS = [
     event(20, "item_done", worker=0, item="c", status="dropped", seconds=5.0, steps=10),
     event(20, "ended"),
 ]
-MANIFEST = Manifest(stage="render", outputs=[], counts=Tally(input=3, kept=2, dropped={"far": 1}), seconds=20.0)
 
 
 def test_figures_of_a_run():
-    assert rendering_figures(EVENTS, MANIFEST) == {"2 workers": [20.0, 120, 80, 4.0, 1.0, 1.5, 220.0, 1, 0]}
+    manifest = Manifest(stage="render", outputs=[], counts=Tally(input=3, kept=2, dropped={"far": 1}), seconds=20.0)
+    assert rendering_figures(EVENTS, manifest) == {"2 workers": [20.0, 120, 80, 4.0, 1.0, 1.5, 220.0, 1, 0]}
 
 
 def test_what_lost_workers_had_done_is_counted(tmp_path):

@@ -40,14 +40,17 @@ from release.build.config import ReleaseConfig
 from release.build.sources import Source
 from release.record import read_record
 from release.verify.verify import verify
-from specimens import change_json, make_playback_tree
+from specimens import change_json
+
+TOWNS, NAMES = ("Town01", "Town02_Opt"), ("trajectory_1777083733", "trajectory_1777090000")
 
 
 @pytest.fixture(scope="module")
 def foreign(tmp_path_factory) -> Path:
-    return write_foreign_tree(tmp_path_factory.mktemp("foreign"))
+    return write_foreign_tree(tmp_path_factory.mktemp("foreign"), towns=TOWNS, trajectories=NAMES)
 
 
+TRAJECTORY = "Town01/trajectory_1777083733"
 KEPT = CaptionConfig.model_validate({"repair": {"hard_conflict": "keep"}})  # every window has a caption
 
 
@@ -103,27 +106,16 @@ def holds(found: object, wanted: object) -> bool:
     return found == pytest.approx(wanted) if isinstance(wanted, float) else found == wanted
 
 
-def test_a_quirk_is_read_and_survives_writing(foreign, tmp_path, subtests):
-    for variant in ("ORI", "aug_001"):
-        folder = tmp_path / "Town01/trajectory_1777083733" / variant
-        folder.mkdir(parents=True)
-    for name, change in QUIRKS.items():
-        for folder in sorted((tmp_path / "Town01/trajectory_1777083733").iterdir()):
-            with subtests.test(name):
-                shutil.copy(foreign / folder.relative_to(tmp_path) / "trajectory.json", folder)
-                _check_quirk(folder, name, change)
-
-
 def test_false_is_no_place(foreign, tmp_path):
     """Public files write false for an offset that is zero; a target's place is unknown then, not the origin."""
-    folder = tmp_path / "Town01/trajectory_1777083733/ORI"
-    shutil.copytree(foreign / folder.relative_to(tmp_path), folder)
-    change_json(folder / "trajectory.json", each(lambda p: p.update(target={"world_location": False, "depth": 3.0})))
-    assert np.isnan(read_track(folder).targets_m).all()
+    change = each(lambda p: p.update(target={"world_location": False, "depth": 3.0}))
+    assert np.isnan(read_track(rewrite(foreign / TRAJECTORY / "ORI", tmp_path, change)).targets_m).all()
 
 
-def _check_quirk(folder: Path, name: str, change: Callable[[dict], object]) -> None:
-    change_json(folder / "trajectory.json", change)
+@pytest.mark.parametrize("variant", ["ORI", "aug_001"])
+@pytest.mark.parametrize("name", QUIRKS)
+def test_a_quirk_is_read_and_survives_writing(foreign, tmp_path, name, variant):
+    folder = rewrite(foreign / TRAJECTORY / variant, tmp_path, QUIRKS[name])
     flight = read_track(folder)
     assert bool(flight.issues) == (name in TOLERATED)
     assert len(flight) == 16
@@ -161,7 +153,7 @@ def test_nobody_is_no_target(foreign):
 
 def test_the_clean_twin_is_the_track_beside_it(foreign, tmp_path):
     tree = shutil.copytree(foreign, tmp_path / "tree", copy_function=os.link)
-    clean, shaken = (read_track(tree / "Town01/trajectory_1777083733" / variant) for variant in ("ORI", "aug_001"))
+    clean, shaken = (read_track(tree / TRAJECTORY / variant) for variant in ("ORI", "aug_001"))
     twin = read_twin(shaken)
     assert twin is not None
     assert_array_equal(twin.positions_m, clean.positions_m)
@@ -193,19 +185,6 @@ def test_a_foreign_tree_passes_the_inspection_without_plans(way):
     assert {issue.code for flight in found.flights for issue in flight.issues} == {"not_in_this_tree", "no_checksums"}
     assert found.funnel.trajectories.planned == found.funnel.trajectories.accepted == 2
     assert {flight.track for flight in found.flights if flight.variant == "aug_001"} == {"perturbed"}
-
-
-def test_a_foreign_tree_is_captioned_with_the_labels_of_its_clean_twins(way):
-    found = list(read_captions(way / "caption/captions.jsonl"))
-    assert len(found) == 4 * 4  # of 13 points
-    assert {caption.drop_reason for caption in found} <= {None, "no_reason"}
-    labels = {(c.town, c.trajectory, c.variant, c.frame_index): c.label for c in found}
-    shaken = [caption for caption in found if caption.variant == "aug_001"]
-    assert {caption.label_from for caption in shaken} == {"twin"}
-    for caption in shaken:
-        assert caption.label == labels[caption.town, caption.trajectory, "ORI", caption.frame_index]
-    assert len({caption.sample_id for caption in found}) == len(found)
-    assert {caption.sample_id.partition("_trajectory")[0] for caption in found} == {"Town01", "Town10HD_Opt"}
 
 
 def test_a_foreign_tree_gives_samples_and_a_release(way):
@@ -268,11 +247,6 @@ def test_of_a_foreign_tree_what_was_inspected_is_released_and_nothing_else(tmp_p
         failed("c", replace(source, inspect=alone / "inspect.json"))
 
 
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory):
-    return make_playback_tree(tmp_path_factory.mktemp("tree"), num_flights=1, num_points=6)
-
-
 def rewrite(folder, target, change):
     new = target / "Town01" / folder.parent.name / folder.name
     new.mkdir(parents=True, exist_ok=True)
@@ -295,32 +269,22 @@ def test_deviations_from_the_layout_are_noted(tree, tmp_path):
         assert re.search(words, str(first)), words
 
 
-TOWNS, NAMES = ("Town01", "Town02_Opt"), ("trajectory_1777083733", "trajectory_1777090000")
+def names(foreign: Path, **choice) -> list[str]:
+    return [folder.relative_to(foreign).as_posix() for folder in find_tracks(foreign, TrackChoice(**choice))]
 
 
-@pytest.fixture(scope="module")
-def of_towns(tmp_path_factory) -> Path:
-    return write_foreign_tree(
-        tmp_path_factory.mktemp("public") / "tree", towns=TOWNS, trajectories=NAMES, num_points=14
-    )
-
-
-def names(of_towns: Path, **choice) -> list[str]:
-    return [folder.relative_to(of_towns).as_posix() for folder in find_tracks(of_towns, TrackChoice(**choice))]
-
-
-def test_patterns_are_of_folders_and_those_above_them(of_towns):
+def test_patterns_are_of_folders_and_those_above_them(foreign):
     for choice, count in (
         ({}, 8), ({"match": ("Town01",)}, 4), ({"match": ("Town0[12]*/trajectory_177708*",)}, 4),
         ({"match": ("*/ORI",)}, 4),
         ({"match": ("Town01/trajectory_1777083733/ORI", "Town02_Opt/trajectory_1777090000/")}, 3),
         ({"tracks": ("clean",)}, 4), ({"match": ("Town02*",), "tracks": ("perturbed",)}, 2),
     ):  # fmt: skip
-        found = names(of_towns, **choice)
+        found = names(foreign, **choice)
         assert len(found) == count
-        assert set(found) <= set(names(of_towns))
+        assert set(found) <= set(names(foreign))
     words = r"no track folder in this directory matches the patterns of --flights; got Town9; .*Town01/trajectory_1777083733/ORI"
     with pytest.raises(InputError, match=words):
-        names(of_towns, match=("Town9",))
+        names(foreign, match=("Town9",))
     with pytest.raises(InputError, match="this directory has no perturbed track among those that match --flights"):
-        names(of_towns, match=("*/ORI",), tracks=("perturbed",))
+        names(foreign, match=("*/ORI",), tracks=("perturbed",))

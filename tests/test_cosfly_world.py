@@ -192,18 +192,11 @@ PLANNED = {
 }  # fmt: skip
 
 
-def planned_by(answer: str, out: Path, seed: int = 0, **more):
-    with TeacherServer() as server:
-        server.text = lambda body: answer
-        try:
-            run(WorldConfig(prompt="a small town with a statue", planner=server.url, **more), out, seed=seed)
-        finally:
-            planned_by.bodies = [json.loads(body) for body in server.bodies]
-    return out
-
-
 def test_a_models_plan_is_followed_and_its_trace_kept(tmp_path):
-    out = planned_by("<think>a town</think>```json\n" + json.dumps(PLANNED) + "\n```", tmp_path / "w")
+    out = tmp_path / "w"
+    with TeacherServer() as server:
+        server.text = lambda body: "<think>a town</think>```json\n" + json.dumps(PLANNED) + "\n```"
+        run(WorldConfig(prompt="a small town with a statue", planner=server.url), out)
     assert read_model(out / "plan.json", WorldPlan, PLAN_FORMAT) == WorldPlan.model_validate(PLANNED)
     trace = read_json(out / "trace.json", what="trace")
     assert trace["answer"].startswith("<think>")
@@ -212,7 +205,7 @@ def test_a_models_plan_is_followed_and_its_trace_kept(tmp_path):
     placement = read_json(out / "placement.json", what="placement")
     assert [one["name"] for one in placement["placed"]] == ["statue"]
     assert [one["name"] for one in placement["not_placed"]] == ["unicorn", "unicorn"]
-    (body,) = planned_by.bodies
+    body = json.loads(*server.bodies)
     assert "statue" in body["messages"][0]["content"]
     assert body["seed"] == 0
     assert body["response_format"]["json_schema"]["schema"]["properties"].keys() == WorldPlan.model_fields.keys()

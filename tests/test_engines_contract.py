@@ -38,12 +38,10 @@ from cosfly.runtime.journal import Journal
 from distill.inference import stage as infer
 from distill.schema import open_split
 
-OBEDIENT = deciding()
-
 
 def obedient(messages: list[dict], schema: dict) -> str:
     body = {"messages": messages, "response_format": {"json_schema": {"schema": schema}}}
-    return json.dumps(obedient_answer(OBEDIENT, body))
+    return json.dumps(obedient_answer(deciding(), body))
 
 
 class PlainEngine:
@@ -188,7 +186,6 @@ def stand_in(monkeypatch):
         dies_after = None
         awaited = 0  # nothing is finished until so many were asked, or half a minute is over
         finish_reason = "stop"
-        num_loaded = 0
 
         def __init__(self, **arguments) -> None:
             structured = arguments["structured_outputs_config"]
@@ -196,7 +193,6 @@ def stand_in(monkeypatch):
                 raise ValueError("disable_any_whitespace is only supported for xgrammar and guidance backends.")
             if "gdn_prefil" in arguments:
                 raise TypeError("EngineArgs.__init__() got an unexpected keyword argument 'gdn_prefil'")
-            Engine.num_loaded += 1
             self.llm_engine = self
             self.open: list = []
 

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import random
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from cosfly.formats.frames import (
     read_meta,
     read_rgb,
 )
-from cosfly.formats.playback_file import read_track, write_track
+from cosfly.formats.playback_file import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.formats.weather import TIMES, WEATHERS, WeatherParams, resolved
 from cosfly.geometry.axes import intrinsic_matrix
@@ -33,7 +32,7 @@ from cosfly.runtime.config import build
 from cosfly.runtime.errors import ConfigError
 from cosfly.runtime.json_io import read_json
 from release.columns import INTRINSICS, Placement, matrices_of, scalar_row
-from specimens import change_json, make_flight
+from specimens import change_json, make_playback_tree
 
 LEVELS = (110.0, 90.0, 60.0, 30.0)
 SMALL = {"width_px": 160, "height_px": 90, "town": "Street", "first_timestamp": 1776000000}
@@ -53,33 +52,6 @@ def test_a_flight_goes_from_level_to_level():
     assert focal[22] == pytest.approx(np.sqrt(focal[20] * focal[24])), "halfway the picture is halfway larger"
 
 
-def zooming():
-    flight, _ = make_flight(8)
-    intrinsics = np.tile(flight.camera.intrinsic, (8, 1, 1))
-    intrinsics[:, [0, 1], [0, 1]] *= np.linspace(1.0, 2.0, 8)[:, None]
-    return replace(flight, intrinsics=intrinsics)
-
-
-def test_the_cameras_of_a_flight_survive_the_file(tmp_path):
-    flight, folder = zooming(), tmp_path / "Town01/trajectory_1/ORI"
-    folder.mkdir(parents=True)
-    write_track(folder, flight)
-    found = read_track(folder)
-    np.testing.assert_array_equal(found.intrinsics, flight.intrinsics)
-    assert found.camera_at(7).focal_px == pytest.approx(2 * found.camera.focal_px)
-    assert found.fovs_deg[0] < found.fovs_deg[1] == pytest.approx(60.0)
-    row = scalar_row(found, 7, None, Placement("", "walk", "train"))
-    np.testing.assert_array_equal(
-        matrices_of(np.array([row["intrinsics"][name] for name in INTRINSICS])[None])[0], flight.intrinsics[7]
-    )
-    assert row["fov_deg"] == pytest.approx(found.camera_at(7).fov_deg, abs=1e-6)
-    change_json(folder / "trajectory.json", lambda raw: raw["points"][3]["camera"].update(intrinsic=[[0, 0, 0]] * 3))
-    assert any("points[3].camera.intrinsic" in str(issue) for issue in read_track(folder).issues)
-    write_track(folder, replace(flight, intrinsics=None))  # one camera is said once
-    assert all("camera" not in point for point in json.loads((folder / "trajectory.json").read_text())["points"])
-    assert read_track(folder).intrinsics is None
-
-
 def test_every_frame_tells_the_camera_it_was_drawn_with(tmp_path):
     cfg = RenderConfig.model_validate({**SMALL, "zoom": {"mode": "dynamic", "part_s": 2.0, "ramp_s": 1.0}})
     tree = run(cfg, *write_inputs(tmp_path / "inputs", [circling(16)]), tmp_path / "render", seed=2)
@@ -94,6 +66,16 @@ def test_every_frame_tells_the_camera_it_was_drawn_with(tmp_path):
             assert meta.intrinsic == camera.intrinsic.tolist()
             assert meta.fov_deg == pytest.approx(camera.fov_deg, abs=1e-6)
             assert meta.focal_length_35mm_mm == pytest.approx(camera.focal_35mm_mm, abs=1e-6)
+    row = scalar_row(clean, 7, None, Placement("", "walk", "train"))
+    released = matrices_of(np.array([row["intrinsics"][name] for name in INTRINSICS])[None])
+    np.testing.assert_array_equal(released[0], clean.intrinsics[7])
+    assert row["fov_deg"] == pytest.approx(clean.camera_at(7).fov_deg, abs=1e-6)
+    points = clean.folder / "trajectory.json"
+    change_json(points, lambda raw: raw["points"][3]["camera"].update(intrinsic=[[0, 0, 0]] * 3))
+    assert any("points[3].camera.intrinsic" in str(issue) for issue in read_track(clean.folder).issues)
+    one_camera, _ = find_tracks(make_playback_tree(tmp_path / "plain", 1, 4, with_images=False))
+    assert all("camera" not in point for point in read_json(one_camera / "trajectory.json")["points"])
+    assert read_track(one_camera).intrinsics is None
 
 
 SIZE = (320, 180)

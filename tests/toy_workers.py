@@ -81,7 +81,6 @@ def make_idle_worker(folder: Path):
 def make_talking_worker():
     def work(item: Item) -> Outcome:
         logging.getLogger("cosfly.demo").info("%s speaks of %d", item.item_id, 7)
-        logging.getLogger("cosfly.demo").debug("not this")
         return Outcome()
 
     return work

@@ -26,6 +26,7 @@ ALLEY_M = 7.0  # wider than the gap by which buildings are merged
 NUM_PARKS, NUM_SQUARES = 4, 2
 NUM_TREES, TREES_PER_PARK = 420, 30
 NUM_LAMPS, NUM_SIGNALS, NUM_BENCHES, NUM_KIOSKS = 240, 31, 180, 40
+NUM_SIGN_POLES = CENSUS["Poles"] - 3 * NUM_LAMPS - NUM_SIGNALS
 HOUSES_PER_SIDE = 3
 
 Block = tuple[np.ndarray, np.ndarray]  # low and high corner, (2,) each
@@ -127,11 +128,10 @@ def _kerb_places(columns: np.ndarray, rows: np.ndarray, rng: np.random.Generator
     """Places every 6.5 m along all kerbs, a metre off the carriageway, crossings left out; in random order."""
     places: list[Place] = []
     for axis, (across, along) in enumerate(((rows, columns), (columns, rows))):
-        for street in across:
-            for kerb in (street + SIDEWALK_M - 1.0, street + STREET_M - SIDEWALK_M + 1.0):
-                for a, b in itertools.pairwise(along):
-                    for at in np.arange(a + STREET_M + 3.0, b - 2.0, 6.5):
-                        places.append((at, kerb, axis) if axis == 0 else (kerb, at, axis))
+        sides = SIDEWALK_M - 1.0, STREET_M - SIDEWALK_M + 1.0
+        for street, side, (a, b) in itertools.product(across, sides, itertools.pairwise(along)):
+            for at in np.arange(a + STREET_M + 3.0, b - 2.0, 6.5):
+                places.append((at, street + side, axis) if axis == 0 else (street + side, at, axis))
     return [places[k] for k in rng.permutation(len(places))]
 
 
@@ -143,13 +143,13 @@ def _street_furniture(boxes: BoxList, kerbs: list[Place], rng: np.random.Generat
         boxes.add("Poles", (x, y), (0.24, 0.24), 0.0, 7.6)
         boxes.add("Poles", (x, y), (0.12, 0.12), 0.1, 7.4)  # the cable inside
         boxes.add("Poles", (x, y), arm, 7.6, 7.75)
-        if number < CENSUS["TrafficSigns"] - _num_sign_poles():
+        if number < CENSUS["TrafficSigns"] - NUM_SIGN_POLES:
             boxes.add("TrafficSigns", (x, y + 0.16), (0.6, 0.06), 2.3, 2.9)
     for _, (x, y, _axis) in zip(range(NUM_SIGNALS), rest, strict=False):
         boxes.add("Poles", (x, y), (0.16, 0.16), 0.0, 3.4)
         boxes.add("TrafficLight", (x, y + 0.3), (0.36, 0.34), 2.5, 3.5)
         boxes.add("TrafficLight", (x, y + 0.3), (0.3, 0.3), 2.6, 3.4)
-    for _, (x, y, _axis) in zip(range(_num_sign_poles()), rest, strict=False):
+    for _, (x, y, _axis) in zip(range(NUM_SIGN_POLES), rest, strict=False):
         boxes.add("Poles", (x, y), (0.08, 0.08), 0.0, 2.9)
         boxes.add("TrafficSigns", (x, y + 0.07), (0.65, 0.06), 2.2, 2.85)
     for _, (x, y, axis) in zip(range(NUM_BENCHES), rest, strict=False):
@@ -168,10 +168,6 @@ def _street_furniture(boxes: BoxList, kerbs: list[Place], rng: np.random.Generat
     return list(rest)
 
 
-def _num_sign_poles() -> int:
-    return CENSUS["Poles"] - 3 * NUM_LAMPS - NUM_SIGNALS
-
-
 def _trees(boxes: BoxList, parks: list[Block], kerbs: list[Place], rng: np.random.Generator) -> None:
     """A trunk and a cloud of small boxes for each tree, in groves and along the kerbs."""
     places = [
@@ -184,17 +180,12 @@ def _trees(boxes: BoxList, parks: list[Block], kerbs: list[Place], rng: np.rando
     for number, place in enumerate(places):
         height, radius = rng.uniform(6.0, 10.0), rng.uniform(1.6, 2.4)
         boxes.add("Vegetation", place, (0.4, 0.4), 0.0, height * 0.6)
-        _crown(boxes, place, height, radius, num_leaves + (number < extra), rng)
-
-
-def _crown(
-    boxes: BoxList, place: np.ndarray, height: float, radius: float, num_leaves: int, rng: np.random.Generator
-) -> None:
-    directions = rng.normal(size=(num_leaves, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    shares = directions * np.cbrt(rng.uniform(0.0, 1.0, (num_leaves, 1)))
-    sizes = rng.uniform(0.3, 0.9, num_leaves)
-    low, high = 2.6, height - 0.9
-    for (u, v, w), size in zip(shares, sizes, strict=True):
-        base = (low + high) / 2 + w * (high - low) / 2
-        boxes.add("Vegetation", place + radius * np.array([u, v]), (size, size), base, base + size)
+        num = num_leaves + (number < extra)
+        directions = rng.normal(size=(num, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        shares = directions * np.cbrt(rng.uniform(0.0, 1.0, (num, 1)))
+        sizes = rng.uniform(0.3, 0.9, num)
+        low, high = 2.6, height - 0.9
+        for (u, v, w), size in zip(shares, sizes, strict=True):
+            base = (low + high) / 2 + w * (high - low) / 2
+            boxes.add("Vegetation", place + radius * np.array([u, v]), (size, size), base, base + size)

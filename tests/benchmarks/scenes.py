@@ -15,6 +15,7 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.pedestrians.stage import PedestriansConfig, make_pedestrian, walkable_ground
+from cosfly.pedestrians.walkable import WalkableGround
 from cosfly.runtime.config import build
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import SimplifyConfig, simplify
@@ -39,35 +40,32 @@ def city() -> BoxMap | None:
     return load_map(build(MapsConfig, {"source": "simworld", "simworld": {"world": str(world)}}, "benchmark"))
 
 
-def tiled(box_map: BoxMap, columns: int, rows: int) -> BoxMap:
-    """Copies of a map side by side; the first copy stays where the map is."""
+def tiled(box_map: BoxMap, size_m: tuple[float, float]) -> BoxMap:
+    """Copies of a map side by side, of which what lies beyond a size is cut off; the first stays where the map is."""
     low, high = box_map.bounds()
+    columns, rows = np.ceil(size_m / (high - low)[:2]).astype(int)
     step = high[:2] - low[:2] + CITY_GAP_M
     shifts = np.array([(column * step[0], row * step[1], 0.0) for row in range(rows) for column in range(columns)])
     count, tiles = len(box_map), len(shifts)
-    return BoxMap(
+    tiles_map = BoxMap(
         (box_map.centers[None] + shifts[:, None]).reshape(-1, 3), np.tile(box_map.half_extents, (tiles, 1)),
         np.tile(box_map.rotations_deg, (tiles, 1)), np.tile(box_map.kinds, tiles),
         np.arange(1, count * tiles + 1, dtype=np.uint64),
         box_map.header.model_copy(update={"name": f"{box_map.name}{columns}x{rows}"}),
     )  # fmt: skip
-
-
-def cut_to(box_map: BoxMap, size_m: tuple[float, float]) -> BoxMap:
-    low, _ = box_map.bounds()
-    return box_map.select((box_map.maxs[:, :2] <= low[:2] + np.array(size_m)).all(axis=1))
+    return tiles_map.select((tiles_map.maxs[:, :2] <= low[:2] + size_m).all(axis=1))
 
 
 def simplified(raw: BoxMap) -> BoxMap:
     return simplify(raw, SimplifyConfig())
 
 
-def walks_on(box_map: BoxMap, **settings: Any) -> list[PedestrianTrajectory]:
-    """20 walks (`num_paths`) of 75 to 100 m as the crow flies: about 186 points, the length of the paper's pilot."""
-    cfg = PedestriansConfig(**{"num_paths": NUM_WALKS, "min_distance_m": 75.0, **settings})
+def walks_on(box_map: BoxMap, **settings: Any) -> tuple[WalkableGround, list[PedestrianTrajectory]]:
+    """The ground, and 20 walks; of 75 to 100 m as the crow flies they have about 186 points, as the paper's pilot."""
+    cfg = PedestriansConfig(num_paths=NUM_WALKS, **settings)
     ground = walkable_ground(box_map, cfg)
     names = [f"path_{k:05d}" for k in range(cfg.num_paths)]
-    return [make_pedestrian(name, ground, cfg, rng_for(SEED, "pedestrians", name)).trajectory for name in names]
+    return ground, [make_pedestrian(name, ground, cfg, rng_for(SEED, "pedestrians", name)).trajectory for name in names]
 
 
 def cpu_ms(function: Callable[[], Any]) -> tuple[float, Any]:

@@ -53,7 +53,7 @@ class Server:
     def __init__(self, town: BoxMap, faults: Sequence[str]) -> None:
         self.town, self.num_ticks, self.calls = town, 0, queue.SimpleQueue[tuple]()
         self.movers, self.weather = dict[Any, Mover](), None
-        self._faults = [found.groups() for text in faults if (found := FAULT.fullmatch(text))]
+        self._faults = {text: found.groups() for text in faults if (found := FAULT.fullmatch(text))}
         self._renderer, self._size_px, self._prepared_for, self._drawn = None, None, None, ("", None)
 
     def serve(self) -> None:
@@ -74,9 +74,10 @@ class Server:
             os._exit(1)
 
     def due(self, name: str, sensor: str = "") -> float:
-        for planted, its_sensor, tick, plus, seconds in self._faults:
+        for text, (planted, its_sensor, tick, plus, seconds) in self._faults.items():
             is_now = self.num_ticks == int(tick) or ((plus or name == "hang") and self.num_ticks > int(tick))
             if planted == name and is_now and its_sensor in (None, sensor):
+                print(text, flush=True)
                 return float(seconds or 1.0)
         return 0.0
 
