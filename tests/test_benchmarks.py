@@ -29,14 +29,11 @@ plain = bench.load
 bench.load = lambda model, path, told: plain(model, path, [*told, "pedestrians.num_paths=1"])
 bench.FITTED_ON = 200
 """),
-    ("bench_client", "--windows 40 --concurrency 8", r"encoded before .* requests/s"),
     ("bench_flying", "--flights 2 --decisions 4 --workers 1", r"\d+ decisions in .* a second", HERE),
     ("bench_flying", "--envs", r"2 side by side: .* steps a second",
              "import cosfly.envs.episodes; cosfly.envs.episodes.NUM_DECISIONS = 4"),
     ("bench_planning", "--maps a --planners track_astar muco", r"the same loss from the same start",
              SMALL_TOWN + "scenes.NUM_WALKS, bench.WALKS = 1, bench.WALKS.model_copy(update={'num_paths': 1})"),
-    ("bench_release", "8 --rounds 1", r"build: \d+ % of the speed of the copy",
-             "bench.NUM_POINTS, bench.NUM_POOL, bench.FRAMES_RELEASED, bench.SIZE_PX = 8, 1, 4, (160, 90)"),
     ("bench_render", "--frames 2", r"CPU ms a frame", SMALL_TOWN),
     ("bench_training", "--batch 1 --steps 1", r'"tokens_per_s": \d'),
     ("seeing_student", "--language none.gguf --epochs 1 --workers 1 --without none --out OUT RUN/render",
