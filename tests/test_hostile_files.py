@@ -3,7 +3,6 @@ text, pages and cards show it as it is, and no length of it is too long.
 """
 
 import base64
-import copy
 import io
 import json
 import random
@@ -152,6 +151,14 @@ def _other_bytes(data: bytes, rng: Random) -> bytes:
     ])  # fmt: skip
 
 
+def places_in(value: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield where values stand in JSON: what holds each, and its key there."""
+    for key in value if isinstance(value, dict) else range(len(value)):
+        yield value, key
+        if isinstance(value[key], dict | list):
+            yield from places_in(value[key])
+
+
 def _other_value(data: bytes, rng: Random) -> bytes:
     """Change one value of JSON, or of a line of it; the shape stays."""
     lines = data.split(b"\n") if data.count(b'{"') > 1 and data.startswith(b'{"') else [data]
@@ -160,14 +167,7 @@ def _other_value(data: bytes, rng: Random) -> bytes:
         box = [json.loads(lines[k])]
     except ValueError:
         return _other_bytes(data, rng)
-    places: list[tuple[Any, Any]] = []
-    waiting: list[Any] = [box]
-    while waiting:
-        group = waiting.pop()
-        for key in group if isinstance(group, dict) else range(len(group)):
-            places.append((group, key))
-            if isinstance(group[key], dict | list):
-                waiting.append(group[key])
+    places = list(places_in(box))
     group, key = min(rng.sample(places, min(3, len(places))), key=lambda place: len(str(place[1])))
     if isinstance(group, dict) and rng.random() < 0.2:
         del group[key]
@@ -280,29 +280,16 @@ class Tags(HTMLParser):
     handle_startendtag = handle_starttag
 
 
-def texts_in(value: Any, path: tuple = ()) -> Iterator[tuple]:
-    """Yield where texts stand in JSON."""
-    if isinstance(value, str):
-        yield path
-    elif isinstance(value, dict | list):
-        for key in value if isinstance(value, dict) else range(len(value)):
-            yield from texts_in(value[key], (*path, key))
-
-
 def forged(model: type[BaseModel], honest: BaseModel, least: int) -> BaseModel:
     value = honest.model_dump(mode="json")
     count = 0
-    for path in list(texts_in(value)):
-        other = copy.deepcopy(value)
-        place = other
-        for key in path[:-1]:
-            place = place[key]
-        place[path[-1]] = HOSTILE
+    for group, key in [place for place in places_in(value) if isinstance(place[0][place[1]], str)]:
+        text, group[key] = group[key], HOSTILE
         try:
-            model.model_validate(other)
+            model.model_validate(value)
+            count += 1
         except ValidationError:
-            continue  # one of a closed set
-        value, count = other, count + 1
+            group[key] = text  # one of a closed set
     assert count >= least
     return model.model_validate(value)
 
