@@ -405,28 +405,14 @@ def test_a_shaken_track_tells_no_motion_in_numbers(facts):
         assert not re.search(r"\{(change:|mean:target_speed|mean:speed|yaw\})", " ".join(english.values()))
 
 
-def test_captions_are_one_record_in_two_languages(facts):
-    written = [(one, write_answers(one, np.random.default_rng(i))) for i, one in enumerate(facts)]
-    captions = [(one, *answers) for one, answers in written if answers is not None]
-    for one, english, chinese in captions:
-        assert check_mirror(english, chinese, one) is None
-    # A digit of the Chinese text altered to a value that nothing measured is caught.
-    with_numbers = [row for row in captions if re.search(r"\d+\.\d+", row[2].critical_components)]
-    assert len(with_numbers) >= 40
-    for one, english, chinese in with_numbers[:40]:
-        number = re.search(r"\d+\.\d+", chinese.critical_components).group()
-        changed = chinese.critical_components.replace(number, f"{float(number) + 137.77:.2f}")
-        assert check_mirror(english, chinese.model_copy(update={"critical_components": changed}), one) == "number"
-
-
-def test_any_given_decision_is_justified_without_contradiction_or_not_argued(facts):
-    for decision in TOKENS:
+def test_a_decision_given_or_not_is_justified_without_contradiction_or_not_argued(facts):
+    for decision in (None, *TOKENS):
         written = [(one, write_answers(one, np.random.default_rng(3), decision)) for one in facts[::7]]
         given = [(one, *answers) for one, answers in written if answers is not None]
         assert not given or decision != "return_to_home"
         assert len(given) < len(written) or decision != "yaw_left_to_follow"
         for one, english, chinese in given:
-            assert english.flight_decision == chinese.flight_decision == decision
+            assert english.flight_decision == chinese.flight_decision == (decision or english.flight_decision)
             assert contradictions_of(english, one, "en") == contradictions_of(chinese, one, "zh") == []
             assert check_mirror(english, chinese, one) is None
-            assert ACTIONS[decision].zh in chinese.reasoning_trace
+            assert ACTIONS[english.flight_decision].zh in chinese.reasoning_trace
