@@ -8,7 +8,6 @@ import asyncio
 import heapq
 import json
 import logging
-import math
 import socket
 import time
 from collections import Counter
@@ -145,7 +144,7 @@ def test_the_limit_on_concurrency_halves_and_recovers():
     for _ in range(4):
         limit.succeeded(is_quick=False)
     assert limit.limit == 2  # until a quick answer
-    for _ in range(70):
+    for _ in range(62):  # one more per answer, so that it doubles per round
         limit.succeeded(is_quick=True)
     assert limit.limit == 64
     now_s = time.monotonic()
@@ -163,9 +162,11 @@ def test_the_limit_on_concurrency_halves_and_recovers():
     assert limit.limit == 64
 
 
-def waits_of(limit: ConcurrencyLimit, num_slots: int, answer_s: float, timeout_s: float) -> tuple[list[float], float]:
-    """Return how long 500 answers take, waits in the server's queue included, and when the limit is reached."""
-    free_s, in_flight, waits, now_s, full_s = [0.0] * num_slots, [], [], 0.0, math.inf
+@pytest.mark.parametrize(("num_slots", "answer_s"), [(1, 1.0), (1, 5.0), (1, 30.0), (1, 55.0), (4, 20.0)])
+def test_no_request_times_out_in_the_queue_of_a_small_server(num_slots, answer_s):
+    """500 answers, waits in the server's queue included."""
+    limit, timeout_s = ConcurrencyLimit(256), 120.0
+    free_s, in_flight, waits, now_s = [0.0] * num_slots, [], [], 0.0
     while len(waits) < 500:
         while len(in_flight) < int(limit.limit):
             end_s = max(now_s, heapq.heappop(free_s)) + answer_s
@@ -174,22 +175,7 @@ def waits_of(limit: ConcurrencyLimit, num_slots: int, answer_s: float, timeout_s
         now_s, sent_s = heapq.heappop(in_flight)
         waits.append(now_s - sent_s)
         limit.succeeded(waits[-1] < HEADROOM * timeout_s)
-        if limit.limit == limit.ceiling:
-            full_s = min(full_s, now_s)
-    return waits, full_s
-
-
-@pytest.mark.parametrize(("num_slots", "answer_s"), [(1, 1.0), (1, 5.0), (1, 30.0), (1, 55.0), (4, 20.0)])
-def test_no_request_times_out_in_the_queue_of_a_small_server(num_slots, answer_s):
-    waits, _ = waits_of(ConcurrencyLimit(256), num_slots, answer_s, timeout_s=120.0)
-    assert max(waits) < 120.0
-
-
-@pytest.mark.parametrize("num_slots", [64, 256])
-def test_all_slots_of_a_large_server_are_soon_in_use(num_slots):
-    waits, full_s = waits_of(ConcurrencyLimit(num_slots), num_slots, 1.0, timeout_s=120.0)
-    assert max(waits) == 1.0
-    assert full_s <= math.log2(num_slots)
+    assert max(waits) < timeout_s
 
 
 def test_a_retry_after_holds_every_request():
