@@ -163,28 +163,23 @@ def test_a_contradicted_value_is_asked_for_again_with_the_measured_ones(tree, tm
     assert all('"47.5 m"' in text and "horizontal distance: " in text for text in complaints)
 
 
-def test_a_failed_correction_leaves_no_checks_of_the_refused_answer(tree, tmp_path):
-    with (
-        writing_server("The gap of 47.5 m calls for it.", "The gap of {gap} calls for it.") as server,
-        pytest.raises(NothingKept),
-    ):
-        run(settings(server.url, limit=2), tree, tmp_path / "out")
-    for caption in read_captions(tmp_path / "out" / "captions.jsonl"):
-        assert (caption.drop_reason, caption.checks.refused[0]) == ("invalid_slot", "contradicted_value")
-        assert (caption.en, caption.verdict) == (None, None)
-        assert (caption.checks.values, caption.checks.contradictions) == (None, None)
+FALSE, UNKNOWN = "The gap of 47.5 m calls for nothing.", "The gap of {gap} calls for this decision."
 
 
-@pytest.mark.parametrize(("reasons", "reason", "asks"), [
-    ("The gap of 47.5 m calls for nothing.", "contradicted_value", 6),  # both answers share one mirror
-    ("The gap of {gap} calls for this decision.", "invalid_slot", 4),
+@pytest.mark.parametrize(("reasons", "corrected", "reason", "asks"), [
+    (FALSE, FALSE, "contradicted_value", 6),  # both answers share one mirror
+    (UNKNOWN, UNKNOWN, "invalid_slot", 4),
+    (FALSE, UNKNOWN, "invalid_slot", 8),  # the false one has its mirror before it is corrected
 ])  # fmt: skip
-def test_an_answer_that_stays_wrong_drops_its_window_for_that_reason(tree, tmp_path, reasons, reason, asks):
-    with writing_server(reasons) as server, pytest.raises(NothingKept):
+def test_an_answer_that_stays_wrong_drops_its_window_for_that_reason(tree, tmp_path, reasons, corrected, reason, asks):
+    with writing_server(reasons, corrected) as server, pytest.raises(NothingKept):
         run(settings(server.url, limit=2), tree, tmp_path / "out")
-    report = report_of(tmp_path / "out")
-    assert report["windows"]["dropped"] == {reason: 2}
+    assert report_of(tmp_path / "out")["windows"]["dropped"] == {reason: 2}
     assert len(server.bodies) == asks
+    for caption in read_captions(tmp_path / "out" / "captions.jsonl"):
+        if corrected == UNKNOWN:  # of a refused answer nothing stands there
+            assert (caption.en, caption.verdict) == (None, None)
+            assert (caption.checks.values, caption.checks.contradictions) == (None, None)
 
 
 def test_the_question_shows_what_is_known_by_its_slot(tree, tmp_path):
