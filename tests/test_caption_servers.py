@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 
 import pytest
 from commands import invoke
-from specimens_captions import VOCABULARY, deciding
+from specimens_captions import VOCABULARY, deciding, report_of
 from specimens_captions import settings as quick
 from teacher_server import ENGLISH, MODEL, USAGE, Sent, TeacherServer, Wild, completion, obedient_answer, refusal
 
@@ -116,9 +116,6 @@ def dropped(reason: str) -> Outcome:
 IMPATIENT = {"timeout_s": 3.0, "max_tries": 1}  # long enough for the list of models on a busy machine
 FAULTS: dict[str, tuple] = {
     # --- statuses
-    "vLLM: 500, a library of grammars is missing, vllm 16030": (
-        error(500, "xgrammar.so: cannot open shared object file: outlines is not installed either"),
-        silent("http_500")),
     "a gateway: 307 elsewhere, letta 3189": (page(307, "", Location="http://127.0.0.1:1/v1/chat/completions"),
         (TeacherError, "not a chat endpoint", 1, None)),
     "nobody: a refusal without end": (raw(b"HTTP/1.1 500 No\r\n\r\n", b"no " * 99_999, is_endless=True),
@@ -127,8 +124,6 @@ FAULTS: dict[str, tuple] = {
     "nobody: Retry-After 1e18": (error(429, "busy", Retry_After="1e18"), silent("total_timeout",
         "asks to wait 1000000000000000000 s", 1)),
     # --- bodies
-    "vLLM: all in its thoughts, vllm 17349": (message(content=None, reasoning_content="{}"),
-        dropped("structure")),
     "nobody: thoughts without end": (message(content="<think>" + "a <think> {" * 30_000),
         dropped("structure")),
     # --- the wire
@@ -172,11 +167,7 @@ def test_what_becomes_of_a_run_at_a_server_like_this(tree, tmp_path, whole, name
 def events(body: dict) -> Sent:
     """Stream the answer, whatever the request says."""
     text = answer(body)["choices"][0]["message"]["content"]
-    deltas = [
-        {"role": "assistant"},
-        {"reasoning_content": "Hm."},
-        *({"content": text[i : i + 9]} for i in range(0, len(text), 9)),
-    ]
+    deltas = {"role": "assistant"}, {"reasoning_content": "Hm."}, {"content": text[:9]}, {"content": text[9:]}
     chunks = [{"choices": [{"index": 0, "delta": delta, "finish_reason": None}]} for delta in deltas]
     chunks += [{"choices": [{"index": 0, "delta": {}, "finish_reason": "stop"}]}, {"choices": [], "usage": USAGE}]
     lines = [": processing", *(f"data: {json.dumps(chunk)}" for chunk in chunks), "data: [DONE]"]
@@ -244,9 +235,9 @@ def test_a_server_is_understood(tree, tmp_path, name):
             with pytest.raises(NothingKept):
                 run(cfg, tree, out)
     assert all(json.loads(body)["stream"] is False for body in server.bodies)
-    report = json.loads((out / "caption_report.json").read_text(encoding="utf-8"))
-    assert report["windows"]["kept"] == (outcome == "accepted")
+    report = report_of(out)
     windows = report["windows"]
+    assert windows["kept"] == (outcome == "accepted")
     assert windows["dropped"] | windows["failed"] == ({} if outcome == "accepted" else {outcome: 1})
     assert words in str(report["refusals"])
 
@@ -275,8 +266,8 @@ def windows_of(out: Path) -> Counter[str]:
     held = [json.loads(line)["code"] for line in (out / "quarantine.jsonl").read_text(encoding="utf-8").splitlines()]
     if not (out / "caption_report.json").exists():
         return Counter(held)
-    tally = json.loads((out / "caption_report.json").read_text(encoding="utf-8"))["windows"]
-    return Counter({"kept": tally["kept"]} if tally["kept"] else {}) + Counter(tally["dropped"]) + Counter(held)
+    tally = report_of(out)["windows"]
+    return Counter(kept=tally["kept"]) + Counter(tally["dropped"]) + Counter(held)
 
 
 # What is sent in place of the list of models, and what the run says; or that it goes on.

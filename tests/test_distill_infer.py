@@ -84,9 +84,10 @@ def test_a_server_is_asked_as_the_student_was_taught(place, tmp_path):
 
 
 def test_a_server_is_asked_without_pictures_and_trees(place, tmp_path):
-    prepared(place / "tree", place / "captions.jsonl", tmp_path / "set", modalities=())
+    taught = prepared(place / "tree", place / "captions.jsonl", tmp_path / "set", modalities=())
+    assert "no pictures" in (taught / "README.md").read_text()
     with TeacherServer() as server:
-        path = infer.run(served(), tmp_path / "set", [], server.url, tmp_path / "out")
+        path = infer.run(served(), taught, [], server.url, tmp_path / "out")
     assert all(prediction.coc is not None for prediction in read_predictions(path))
     assert not any("image_url" in body.decode() for body in server.bodies)
 

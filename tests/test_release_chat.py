@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from processes import full_disk
+from release_tampering import errors_in
 from specimens_release import CFG, DROPPED, build, release_of
 
 from cosfly.formats.captions import Caption, Coc, read_captions
@@ -121,9 +122,10 @@ def test_a_training_set_is_not_made_of_a_release(run):
 
 
 @pytest.mark.parametrize("format", ["chat", "sharegpt"])
-def test_a_release_without_captions_is_refused(tmp_path, format):
+def test_a_release_without_captions_verifies_and_is_no_conversation(tmp_path, format):
     make_playback_tree(tmp_path / "tree", 1, 4, width_px=96, height_px=54)  # too short for a window
     dataset = release_of(tmp_path)
+    assert errors_in(dataset, "rows") == {}
     with pytest.raises(CosflyError, match="no caption to export"):
         exported(dataset, tmp_path / "out", format)
     assert not (tmp_path / "out" / format).exists()

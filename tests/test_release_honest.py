@@ -24,13 +24,10 @@ from simulator_serving import serving
 from teacher_server import TeacherServer
 
 from caption.stage.released import read_released
-from cosfly.formats.captions import write_captions
 from cosfly.maps import synthetic
 from cosfly.pipeline import run as pipeline
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
-from release.build import stage as package
-from release.build.sources import Source
 from release.verify.verify import verify
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
@@ -113,7 +110,6 @@ KINDS = {
     "town few frames": ("town", ["release.num_frames=12"]),
     "town slots of a teacher": ("town", [TEACHER, "caption.writing=slots"]),
     "town prose": ("town", [TEACHER, "caption.writing=prose"]),
-    "town without captions": ("town", []),
     "uneven town": ("uneven", []),
     "river narrow": ("river", NARROW),
     "towers haze": ("towers", weather("smog", "morning")),
@@ -156,14 +152,8 @@ def made(tmp_path_factory) -> Iterator[Callable[[str], Path]]:
             work(pipeline.stages(settings(map_name, []), shared)[: len(SHARED_STAGES)])
         for name in SHARED_STAGES:
             shutil.copytree(shared / name, out / name, copy_function=os.link)
-        cfg = settings(map_name, told)
-        if not kind.endswith("without captions"):
-            work(pipeline.stages(cfg, out))
-            return out / "release/dataset"
-        work(pipeline.stages(cfg, out)[:-2])
-        write_captions(out / "none.jsonl", [])
-        source = Source.of_files(out / "render", out / "none.jsonl", out / "inspect/inspect.json")
-        return package.run(cfg.release, [source], out / "release")
+        work(pipeline.stages(settings(map_name, told), out))
+        return out / "release/dataset"
 
     with (
         TeacherServer() as teacher,
