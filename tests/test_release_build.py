@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from PIL import Image
 from release_tampering import errors_in, forge
 from specimens_foreign import write_foreign_tree
 from specimens_release import (
@@ -41,7 +40,6 @@ from cosfly.geometry.trajectory_metrics import derivative_rms, length_m
 from cosfly.runtime.errors import ConfigError, InputError, NothingKept, VerifyError
 from cosfly.runtime.io import sha256_file, write_checksums
 from cosfly.runtime.json_io import read_json
-from cosfly.runtime.png import colours_of
 from release.build.config import ReleaseConfig
 from release.build.shards import points_part
 from release.build.sources import Source
@@ -195,19 +193,11 @@ def other_size(root: Path) -> None:
         shutil.copytree(next(other.glob(f"*/*/{variant}")), target)
 
 
-def other_kind(frame_file: str, kind: str):
-    def change(root: Path) -> None:
-        path = first_flight(root) / "frames_playback/frame_00005" / frame_file
-        picture = Image.fromarray(colours_of(path.read_bytes(), path))
-        if kind == "16 bits":
-            path.write_bytes(cv2.imencode(".png", np.asarray(picture, np.uint16) * 257)[1].tobytes())
-        else:
-            picture.convert("L").save(path)
-
-    return change
-
-
 FIFTH = "frames_playback/frame_00005"
+
+
+def painted(frame_file: str, *shape: int, dtype=np.uint8):
+    return lambda root: cv2.imwrite(str(first_flight(root) / FIFTH / frame_file), np.zeros(shape, dtype))
 
 
 def caption(**values):
@@ -229,8 +219,8 @@ def not_finite(root: Path) -> None:
 DAMAGES = {
     "depth cut by 100 bytes": (lambda r: cut(first_flight(r) / FIFTH / "depth.npy", 100), "depth.npy"),
     "a picture cut short": (lambda r: cut(first_flight(r) / FIFTH / "rgb.png", 20), "rgb.png"),
-    "a picture of 16 bits": (other_kind("rgb.png", "16 bits"), "16 bits, colour type 2"),
-    "a mask of grey": (other_kind("instance.png", "grey"), "1 channels, not RGB"),
+    "a picture of 16 bits": (painted("rgb.png", 27, 48, 3, dtype=np.uint16), "16 bits, colour type 2"),
+    "a mask of grey": (painted("instance.png", 27, 48), "1 channels, not RGB"),
     "a picture that is missing": (lambda r: (first_flight(r) / FIFTH / "instance.png").unlink(), "missing or empty"),
     "1e999 in a trajectory": (not_finite, "is not finite"),
     "pictures of two sizes": (other_size, "the tracks differ in the size of pictures"),
