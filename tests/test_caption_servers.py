@@ -108,11 +108,6 @@ def silent(cause: str, words: str = "", num_asked: int = TRIES) -> Outcome:
     return TeacherError, words, num_asked, cause
 
 
-def dropped(reason: str) -> Outcome:
-    """The window is dropped for good: the answer was one, and is not paid for twice."""
-    return NothingKept, "", 3, reason
-
-
 IMPATIENT = {"timeout_s": 3.0, "max_tries": 1}  # long enough for the list of models on a busy machine
 FAULTS: dict[str, tuple] = {
     # --- statuses
@@ -124,8 +119,9 @@ FAULTS: dict[str, tuple] = {
     "nobody: Retry-After 1e18": (error(429, "busy", Retry_After="1e18"), silent("total_timeout",
         "asks to wait 1000000000000000000 s", 1)),
     # --- bodies
+    # dropped for good: the answer was one, and is not paid for twice
     "nobody: thoughts without end": (message(content="<think>" + "a <think> {" * 30_000),
-        dropped("structure")),
+        (NothingKept, "", 3, "structure")),
     # --- the wire
     "nobody: a bomb of gzip": (lambda body: Sent(200, BOMB, {"Content-Encoding": "gzip"}), silent("connection",
         "the response is compressed")),
@@ -194,29 +190,19 @@ def cut_after(num_tokens: int) -> Callable[[dict], Sent]:
     return page(200, json.dumps({"choices": [choice], "usage": USAGE | {"completion_tokens": num_tokens}}))
 
 
-def refuses_system(body: dict) -> Sent | None:
-    has_system = body["messages"][0]["role"] == "system"
-    return error(400, "System role not supported")({}) if has_system else None
-
-
-def takes_one_sampling_parameter(body: dict) -> Sent | None:
-    words = "`temperature` and `top_p` cannot both be specified for this model. Please use only one."
-    return error(400, words)({}) if {"temperature", "top_p"} <= body.keys() else None
-
-
-def refuses_roles(body: dict) -> Sent:
-    return error(400, "Conversation roles must alternate user/assistant/user/assistant/...")(body)
-
-
+NO_SYSTEM = refusal(400, "System role not supported")
+ONE_ONLY = refusal(400, "`temperature` and `top_p` cannot both be specified for this model. Please use only one.")
 # A server that has to be understood: what it sends, settings, what becomes of the window, words of the report.
 UNDERSTOOD: dict[str, tuple] = {
     "streams in spite of stream: false": (events, {}, "accepted", ""),
     "loads its model": (once(error(503, "Loading model")), {}, "accepted", ""),
     "a gateway: 200 with a code": (once(page(200, '{"code": 429, "msg": "concurrency limit exceeded"}')),
         {"max_tries": 2}, "accepted", ""),
-    "no system role": (refuses_system, {}, "accepted", ""),
-    "refuses all roles": (refuses_roles, {}, "refused", "roles must alternate"),
-    "temperature or top_p": (takes_one_sampling_parameter, {"extra_body": {"top_p": None}}, "accepted", ""),
+    "no system role": (lambda body: NO_SYSTEM if body["messages"][0]["role"] == "system" else None, {}, "accepted", ""),
+    "refuses all roles": (error(400, "Conversation roles must alternate user/assistant/user/assistant/..."), {},
+        "refused", "roles must alternate"),
+    "temperature or top_p": (lambda body: ONE_ONLY if {"temperature", "top_p"} <= body.keys() else None,
+        {"extra_body": {"top_p": None}}, "accepted", ""),
     "its thoughts use up all tokens": (cut_after(0), {}, "structure", ""),
     "vLLM: its context is full": (cut_after(7), {}, "context_full", ""),
     "declines": (message(content=None, refusal=DECLINED_WORDS), {}, "declined", DECLINED_WORDS),
@@ -341,7 +327,7 @@ def patient(**defects: Any) -> Callable[[dict], tuple[int, dict]]:
         if None in body.values() and not own.takes_null:
             return refusal(400, "Input should be a valid number")
         if body["messages"][0]["role"] == "system" and not own.has_system:
-            return refusal(400, "System role not supported")
+            return NO_SYSTEM
         if len(json.dumps(body)) > own.most_bytes:
             return refusal(413, "Request Entity Too Large")
         num_words = sum(len(part.get("text", "").split()) for part in parts)
@@ -373,7 +359,8 @@ def patient(**defects: Any) -> Callable[[dict], tuple[int, dict]]:
 
 
 def examine(behaviour: Callable, context: int = CONTEXT, **changes) -> dict[str, Finding]:
-    with TeacherServer(respond=behaviour, model_facts={"max_model_len": context}) as server:
+    listed = Sent(200, json.dumps({"data": [{"id": MODEL, "max_model_len": context}]}).encode())
+    with TeacherServer(respond=behaviour, list_models=lambda: listed) as server:
         cfg = CaptionConfig.model_validate(changes)
         return {finding.name: finding for finding in examine_endpoint(server.url, cfg, VOCABULARY)}
 

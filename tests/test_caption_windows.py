@@ -32,7 +32,6 @@ from caption.verification.facts import measure_facts
 from caption.verification.references import look_up, parse_reference
 from cosfly.formats.captions import OWN_PROMPTS, PICTURES_MARK, Coc, Prompt, read_captions
 from cosfly.formats.people import Goal
-from cosfly.formats.playback import Track
 from cosfly.formats.playback_file import read_track, write_track
 from cosfly.formats.segments import Mission
 from cosfly.formats.tracks import find_tracks, read_twin
@@ -164,18 +163,13 @@ def two_tracks(tmp_path_factory):
     return root
 
 
-def flights_of(root) -> tuple[Track, Track]:
-    clean, perturbed = (read_track(folder) for folder in find_tracks(root))
-    return clean, perturbed
-
-
 def labels_of(windows) -> list[str | None]:
     return [TABLE.label_of(measure(window.future)) for window in windows]
 
 
 @pytest.mark.parametrize("label_from", ["twin", "offsets"])
 def test_both_tracks_have_the_same_labels_where_the_same_was_visible(two_tracks, label_from):
-    clean, perturbed = flights_of(two_tracks)
+    clean, perturbed = map(read_track, find_tracks(two_tracks))
     twin = read_twin(perturbed) if label_from == "twin" else None
     expected = list(cut_windows(clean, NO_IMAGES))
     found = list(cut_windows(perturbed, NO_IMAGES, twin=twin))
