@@ -23,7 +23,7 @@ from cosfly.inspection.settings import InspectConfig
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE, read_chat_format, write_chat_format
 from cosfly.runtime.errors import ConfigError, InputError
 from distill.inference import stage as infer
-from distill.schema import Sample, open_split
+from distill.schema import open_split
 from distill.training.stage import chat_format_of
 from release.build import stage as package
 from release.build.sources import Source
@@ -138,7 +138,7 @@ def place(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("students")
     tree = make_playback_tree(root / "tree", 3, 14)
     captions = run(CaptionConfig.model_validate({"image": {"max_side_px": SIDE_PX}}), tree, root / "rules")
-    prepared(tree, captions, root / "set", modalities=("rgb", "depth"))
+    prepared(tree, captions, root / "set", modalities=("rgb", "depth"), val_fraction=0, test_fraction=0)
     (root / "trained" / "adapter").mkdir(parents=True)
     write_chat_format(root / "trained" / "adapter", chat_format_of(open_split(root / "set", "train"), MAX_PIXELS))
     return root
@@ -158,29 +158,20 @@ def settings(url: str, folder: Path, **changes: Any) -> CaptionConfig:
     })  # fmt: skip
 
 
-def infer_all(place: Path, url: str, out: Path, **changes: Any) -> list[Sample]:
-    samples: list[Sample] = []
-    for split in ("train", "val", "test"):
-        cfg = infer.InferConfig.model_validate({
-            "split": split, "engine": "endpoint", "max_pixels": MAX_PIXELS, "endpoint": {"timeout_s": 60.0}, **changes,
-        })  # fmt: skip
-        infer.run(cfg, place / "set", [place / "tree"], url, out / split)
-        samples += open_split(place / "set", split)
-    return samples
-
-
 @pytest.mark.parametrize("constrained", [False, True])
 def test_requests_are_those_of_infer_to_the_byte(place, tmp_path, constrained):
     decide = label_of(place)
     with TeacherServer(decision=decide) as server:
-        samples = infer_all(place, server.url, tmp_path / "infer", constrained=constrained)
-        asked = set(server.bodies)
+        cfg = {"split": "train", "engine": "endpoint", "max_pixels": MAX_PIXELS, "endpoint": {"timeout_s": 60.0}}
+        asking = infer.InferConfig.model_validate(cfg | {"constrained": constrained})
+        infer.run(asking, place / "set", [place / "tree"], server.url, tmp_path / "infer")
+        asked, samples = set(server.bodies), open_split(place / "set", "train")
         assert len(asked) == len(samples) == len(server.bodies)
         assert {sample.language for sample in samples} == {"en", "zh"}
         server.bodies.clear()
         student = {"folder": place / "trained", "constrained": constrained}
-        cfg = settings(server.url, place / "trained", student=student)
-        captions = list(read_captions(run(cfg, place / "tree", tmp_path / "captions")))
+        own = settings(server.url, place / "trained", student=student)
+        captions = list(read_captions(run(own, place / "tree", tmp_path / "captions")))
         windows = {sample.sample_id for sample in samples}
         assert windows <= {caption.sample_id for caption in captions}
         assert asked <= set(server.bodies)  # and further windows, which the training set left out

@@ -11,8 +11,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from commands import invoke
-from release_lies import LIES, at, captioned, change, everything, put
-from release_tampering import depth_of, errors_in, forge, rewrite, set_depth
+from release_lies import LIES, at, captioned, change, everything, put, with_depth
+from release_tampering import errors_in, forge, rewrite, set_depth
 from specimens_foreign import hub_snapshot
 
 from caption.stage.released import read_released
@@ -54,13 +54,11 @@ def test_a_release_that_the_kit_wrote_again_passes(honest, tmp_path):
 def test_depth_in_half_precision_passes(honest, tmp_path):
     """A server of Unreal sends such depth, in centimetres."""
 
-    def rounded(rows: list[dict]) -> None:
-        for row in rows:
-            depth = depth_of(row)
-            half = (depth * 100).astype(np.float16).astype(np.float32) / 100
-            set_depth(row, np.where(depth < 600.0, half, depth))
+    def rounded(depth: np.ndarray, _: dict) -> np.ndarray:
+        half = (np.minimum(depth, 600.0) * 100).astype(np.float16).astype(np.float32) / 100
+        return np.where(depth < 600.0, half, depth)
 
-    assert errors_in(forge(honest, tmp_path / "forged", rounded)) == {}
+    assert errors_in(forge(honest, tmp_path / "forged", change(everything, with_depth(rounded)))) == {}
 
 
 @pytest.mark.slow
