@@ -22,7 +22,7 @@ import yaml
 from processes import ran
 from simulator_serving import serving
 from specimens_foreign import write_foreign_tree
-from teacher_server import TeacherServer
+from teacher_server import TeacherServer, completion
 from test_caption_servers import patient
 from test_cosfly_derived_ground import sloped_city
 from test_cosfly_map_kinds import node, write_world
@@ -217,8 +217,7 @@ def answer(body: dict) -> tuple[int, dict] | None:
     text = json.dumps(body)
     if "REJECT_REGEN" in text:
         verdict = json.dumps({"verdict": "FIX_LABEL", "reason": "the text argues for the label"})
-        choice = {"message": {"role": "assistant", "content": verdict}, "finish_reason": "stop"}
-        return 200, {"choices": [choice], "usage": {"prompt_tokens": 9, "completion_tokens": 9}}
+        return 200, completion(body, verdict)
     is_doctors = "Nothing has to change." in text  # the largest prompt, whose tokens must be counted
     return None if "flight_decision" in text and not is_doctors else patient()(body)
 
