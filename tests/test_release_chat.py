@@ -13,7 +13,6 @@ from cosfly.formats.captions import Caption, Coc, read_captions
 from cosfly.runtime.config import build as build_config
 from cosfly.runtime.errors import CosflyError, InputError, StorageError
 from cosfly.runtime.png import png_size
-from cosfly.runtime.tables import rows_of
 from distill.prepare.stage import RunSource
 from release.export.stage import EXPORTS, ExportConfig
 from release.export.stage import run as export
@@ -59,11 +58,15 @@ def test_the_last_frame_alone_needs_no_consecutive_frames(run, tmp_path, format)
     assert released > 0
 
 
+def lines_of(path: Path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
 @pytest.mark.parametrize("shown", ["all", "last"])
 def test_messages_are_what_their_loaders_ask_for(run, tmp_path, shown):
     datasets = pytest.importorskip("datasets")
     product = exported(run, tmp_path / "out", frames=shown)
-    samples = list(rows_of(product / "train.jsonl"))
+    samples = lines_of(product / "train.jsonl")
     found = datasets.load_dataset(
         "json", data_files=str(product / "train.jsonl"), split="train", cache_dir=str(tmp_path / "cache")
     )
@@ -90,7 +93,7 @@ def test_pictures_have_the_pixels_of_which_the_texts_speak(tmp_path):
     make_playback_tree(tmp_path / "tree", 1, NUM_POINTS, width_px=96, height_px=54)
     dataset = release_of(tmp_path, picture_px=(32, 18))
     product = exported(dataset, tmp_path / "out")
-    [sample, *_] = rows_of(product / "train.jsonl")
+    [sample, *_] = lines_of(product / "train.jsonl")
     assert "pictures of 32 x 18 px" in json.dumps(sample)
     assert {png_size((product / name).read_bytes()) for name in sample["images"]} == {(32, 18)}
 
