@@ -95,11 +95,7 @@ class _Watch:
 
         def watched_write(data: Any) -> Any:
             def half() -> None:
-                write(
-                    memoryview(data).cast("B")[: memoryview(data).nbytes // 2]
-                    if "b" in opened.mode
-                    else data[: len(data) // 2]
-                )
+                write(data[: len(data) // 2])
                 opened.flush()
 
             self._step("write", path, half)

@@ -1,6 +1,7 @@
 """Captions of somebody else: files, and a student behind a server, asked as it was taught, to the byte."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -93,7 +94,7 @@ def test_what_is_wrong_with_a_caption_drops_its_window(tree, rules, tmp_path, ch
 
 
 BAD = [
-    ('{"sample_id": "a"}', "en"), ("[1]", ":2"), ("{broken", ":2"),
+    ('{"sample_id": "a"}', "en"), ("[1]", ""), ("{broken", ""),
     ('{"sample_id": "a", "en": {"critical_components": 7}}', "en.critical_components"),
     (json.dumps({"sample_id": "a", "en": EN | {"flight_decision": "hover"}, "colour": "red"}), "colour"),
     (json.dumps({"sample_id": "first", "en": EN | {"flight_decision": "hover"}}), "sample_id"),
@@ -105,10 +106,8 @@ def test_a_bad_line_names_file_line_and_field(tmp_path, text, field):
     path = tmp_path / "theirs.jsonl"
     good = json.dumps({"sample_id": "first", "en": EN | {"flight_decision": "hover"}})
     path.write_text(f"{good}\n{text}\n")
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=f"{re.escape(str(path))}:2.*{re.escape(field)}"):
         read_foreign(path)
-    assert f"{path}:2" in str(caught.value)
-    assert field in str(caught.value)
 
 
 def test_from_a_students_answers_to_a_release(tree, rules, tmp_path):

@@ -142,9 +142,8 @@ def test_what_becomes_of_a_run_at_a_server_like_this(tree, tmp_path, whole, name
     respond, (error_kind, words, most_asked, cause), *patience = FAULTS[name]
     out = tmp_path / "out"
     with deciding(respond=respond) as server:
-        with pytest.raises(error_kind) as caught:
+        with pytest.raises(error_kind, match=re.escape(words) or None):
             run(settings(server.url, endpoint=patience[0] if patience else {}), tree, out)
-        assert words in str(caught.value)
         # One who waits so short a time may be gone before a busy server has read what was asked, which then comes late.
         asked = len(server.bodies)
         assert asked <= most_asked if patience else asked == most_asked
@@ -168,9 +167,6 @@ def events(body: dict) -> Sent:
     chunks += [{"choices": [{"index": 0, "delta": {}, "finish_reason": "stop"}]}, {"choices": [], "usage": USAGE}]
     lines = [": processing", *(f"data: {json.dumps(chunk)}" for chunk in chunks), "data: [DONE]"]
     return Sent(200, "\n\n".join(lines).encode())
-
-
-DECLINED_WORDS = "I'm sorry, I can't help with following a person."
 
 
 def once(first: Callable[[dict], Sent]) -> Callable[[dict], Sent | None]:
@@ -205,7 +201,6 @@ UNDERSTOOD: dict[str, tuple] = {
         {"extra_body": {"top_p": None}}, "accepted", ""),
     "its thoughts use up all tokens": (cut_after(0), {}, "structure", ""),
     "vLLM: its context is full": (cut_after(7), {}, "context_full", ""),
-    "declines": (message(content=None, refusal=DECLINED_WORDS), {}, "declined", DECLINED_WORDS),
 }  # fmt: skip
 
 

@@ -390,9 +390,8 @@ def test_a_release_takes_the_licence_of_its_maps_unless_told_and_names_them(rele
 )  # fmt: skip
 def test_a_release_without_a_licence_is_refused(release_inputs, tmp_path, licences, got):
     source = with_maps(release_inputs, tmp_path / "in", **licences)
-    with pytest.raises(ConfigError, match=r"release\.licence") as caught:
+    with pytest.raises(ConfigError, match=rf"{re.escape(got)}.*release\.licence"):
         build(source, tmp_path / "r", UNLICENSED)
-    assert got in str(caught.value)
     assert not (tmp_path / "r" / "dataset").exists()
 
 
