@@ -100,24 +100,24 @@ def test_changing_all_future_frames_leaves_requests_byte_identical(tree, tmp_pat
         assert (before == after) is is_same
 
 
-def test_facts_of_a_hand_made_window(tree):
-    window = next(cut_windows(flight_in(tree), WindowConfig())).observed
+def window_of(*columns: np.ndarray) -> ObservedWindow:
+    """A window whose frames have these columns, and no pictures."""
+    place = ("track_ORI_frame_00004", "Town", "track", "ORI", tuple(range(5)), 1280, 720)
+    return ObservedWindow(*place, observed_frames(*columns), (Path("frame"),) * 5, (frozenset[str](),) * 5)
+
+
+def test_facts_of_a_hand_made_window():
     x = np.arange(5.0)
-    window = dataclasses.replace(
-        window,
-        width_px=640,
-        height_px=360,
-        frames=observed_frames(
-            100.0 + 0.5 * x,
-            np.stack([x, 0 * x, 20.0 - 0.5 * x], axis=1),  # 1 m forward, 0.5 m down per 0.5 s
-            np.stack([0 * x - 30.0, np.array([178.0, 179.0, -180.0, -179.0, -178.0]), 0 * x], axis=1),
-            np.stack([x + 15.0, 0 * x, 0 * x + 0.9], axis=1),
-            np.full((5, 2), np.nan),
-            np.tile([340.0, 160.0, 360.0, 220.0], (5, 1)),
-            np.array([True, True, True, True, False]),
-            np.array([True, True, True, False, False]),
-            np.array([np.nan, 1.0, 0.5, 0.1, 0.0]),
-        ),
+    window = window_of(
+        100.0 + 0.5 * x,
+        np.stack([x, 0 * x, 20.0 - 0.5 * x], axis=1),  # 1 m forward, 0.5 m down per 0.5 s
+        np.stack([0 * x - 30.0, np.array([178.0, 179.0, -180.0, -179.0, -178.0]), 0 * x], axis=1),
+        np.stack([x + 15.0, 0 * x, 0 * x + 0.9], axis=1),
+        np.full((5, 2), np.nan),
+        np.tile([660.0, 340.0, 680.0, 400.0], (5, 1)),
+        np.array([True, True, True, True, False]),
+        np.array([True, True, True, False, False]),
+        np.array([np.nan, 1.0, 0.5, 0.1, 0.0]),
     )
     facts = measure_facts(window)
     assert facts.speed_mps == (2.24, 2.24, 2.24, 2.24, 2.24)  # sqrt(1 + 0.25) / 0.5
@@ -237,7 +237,7 @@ def make_window(hidden: tuple[bool, ...] = (False,) * 5, turn_deg: float = 0.0) 
     """A drone that flies along +y at 1 m/s, 19.1 m above the hip of a pedestrian who walks along -x at 2 m/s."""
     x = np.arange(5.0)
     flags = np.array(hidden)
-    frames = observed_frames(
+    return window_of(
         0.5 * x,
         np.stack([0 * x + 100.0, 0.5 * x, 0 * x + 20.0], axis=1),
         np.stack([0 * x - 45.0, 90.0 + turn_deg * x, 0 * x], axis=1),
@@ -248,9 +248,6 @@ def make_window(hidden: tuple[bool, ...] = (False,) * 5, turn_deg: float = 0.0) 
         ~flags,
         np.where(flags, 0.0, 1.0),
     )
-    folders = (Path("frame"),) * 5
-    place = ("track_ORI_frame_00004", "Town", "track", "ORI", tuple(range(5)), 1280, 720)
-    return ObservedWindow(*place, frames, folders, (frozenset[str](),) * 5)
 
 
 def lines_of(window: ObservedWindow, vocabulary=RELATIVE, language="en") -> list[str]:

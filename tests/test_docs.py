@@ -54,25 +54,13 @@ def test_the_readme_is_short():
     assert len(README.splitlines()) <= 90
 
 
-def anchors_of(page: Path) -> set[str]:
-    """What its headings are called in links: small letters, hyphens for spaces, no punctuation."""
-    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
-    return {
-        re.sub(r"[^\w\- ]", "", name.lower()).replace(" ", "-") for name in re.findall(r"^#+ +(.+)", text, re.MULTILINE)
-    }
-
-
-def test_links_and_pictures_exist():
-    num_anchors = 0
-    for page in PAGES:
-        for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", page.read_text(encoding="utf-8")):
-            if "://" in target:
-                continue
-            there = page.parent / target if target else page
-            assert there.exists(), f"{page.name} links to {target}"
-            assert not anchor or anchor in anchors_of(there), f"{page.name} links to {target}#{anchor}"
-            num_anchors += bool(anchor)
-    assert num_anchors > 20
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md"])
+def test_links_and_pictures_outside_the_site_exist(name):
+    """Those of the site fail when it is built, `test_the_site_is_built_without_a_warning`."""
+    for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", (ROOT / name).read_text(encoding="utf-8")):
+        if "://" not in target:
+            assert (ROOT / target).exists(), target
+            assert not anchor or f"\n## {anchor.replace('-', ' ')}\n" in (ROOT / target).read_text().lower(), anchor
 
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
