@@ -115,8 +115,8 @@ def test_every_file_of_the_files_page_is_written_by_code():
 
 def test_the_site_is_built_without_a_warning(tmp_path):
     pytest.importorskip("mkdocs")
-    words = f"-m mkdocs build --strict -q -f {ROOT / 'mkdocs.yml'} -d {tmp_path / 'site'}"
-    assert ran(sys.executable, *words.split(), cwd=tmp_path).stderr == ""
+    words = f"-m mkdocs build --strict -f {ROOT / 'mkdocs.yml'} -d {tmp_path / 'site'}"  # with -q no warning counts
+    ran(sys.executable, *words.split(), cwd=tmp_path)
     assert {f"{page.stem}.html" for page in (ROOT / "docs").rglob("*.md")} <= {
         p.name for p in (tmp_path / "site").rglob("*.html")
     }
