@@ -16,12 +16,11 @@ from caption.schema import CaptionConfig, JudgeConfig, RepairConfig, WindowConfi
 from caption.stage import stage
 from caption.stage.compare import Trial, compare, try_strategy
 from caption.stage.stage import run
-from caption.stage.window_loop import caption_window
 from caption.stage.windows import cut_windows
 from caption.teachers.judge import JUDGEMENTS, UNJUDGED, check_judge, gold_conflicts, judge_messages, parse_judgement
 from caption.teachers.teacher import RuleTeacher
 from caption.verification.actions import TABLE, measure
-from cosfly.formats.captions import Caption, Coc, read_captions
+from cosfly.formats.captions import Coc, read_captions
 from cosfly.formats.playback_file import read_track, write_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.contract import NoAnswer
@@ -173,22 +172,13 @@ def test_captions_of_another_prompt_are_refused_by_name(tree, tmp_path, monkeypa
 CFG = CaptionConfig(window=WindowConfig(require_images=False))
 
 
-@pytest.mark.parametrize("treatment", ["keep", "drop"])
-def test_what_becomes_of_a_soft_conflict(treatment):
-    windows = cut_flight(60)
-
-    def captioned(repair: RepairConfig) -> list[Caption]:
-        cfg = CFG.model_copy(update={"repair": repair})
-        return [asyncio.run(caption_window(window, RuleTeacher(0), cfg, VOCABULARY)) for window in windows]
-
-    soft = [i for i, caption in enumerate(captioned(RepairConfig())) if caption.verdict == "SOFT_CONFLICT"]
+def test_a_soft_conflict_is_kept_unless_the_settings_drop_it(tree, done, tmp_path):
+    cfg = CaptionConfig.model_validate({"repair": {"soft_conflict": "drop"}})
+    kept, dropped = (list(read_captions(path)) for path in (done / "captions.jsonl", run(cfg, tree, tmp_path / "out")))
+    soft = [(one, other) for one, other in zip(kept, dropped, strict=True) if one.verdict == "SOFT_CONFLICT"]
     assert soft
-    treated = captioned(RepairConfig(soft_conflict=treatment))
-    for caption in (treated[i] for i in soft):
-        if treatment == "keep":
-            assert (caption.status, caption.verdict, caption.repair) == ("accepted", "SOFT_CONFLICT", None)
-        else:
-            assert caption.drop_reason == "conflict"
+    for one, other in soft:
+        assert (one.status, one.repair, other.drop_reason) == ("accepted", None, "conflict")
 
 
 @pytest.mark.parametrize("strategy", ["anchored", "cascade"])
