@@ -63,9 +63,8 @@ def test_each_epoch_sees_each_sample_once():
         assert sorted(i for step in steps[3 * epoch : 3 * epoch + 3] for i in step) == list(range(10))
     assert steps[0] != steps[3]
     assert list(steps_from(cfg, num_samples=10, seed=4, first=4)) == steps[4:]
-    assert (
-        len(list(steps_from(TrainConfig(max_steps=2), 100, 0, 0))) == count_steps(TrainConfig(max_steps=2), 100)[0] == 2
-    )
+    few = TrainConfig(max_steps=2)
+    assert len(list(steps_from(few, 100, 0, 0))) == count_steps(few, 100)[0] == 2
 
 
 def test_loss_falls_and_the_log_tells_how_fast(trained):
