@@ -111,19 +111,15 @@ def silent(cause: str, words: str = "", num_asked: int = TRIES) -> Outcome:
 
 IMPATIENT = {"timeout_s": 3.0, "max_tries": 1}  # long enough for the list of models on a busy machine
 FAULTS: dict[str, tuple] = {
-    # --- statuses
     "a gateway: 307 elsewhere, letta 3189": (page(307, "", Location="http://127.0.0.1:1/v1/chat/completions"),
         (TeacherError, "not a chat endpoint", 1, None)),
     "nobody: a refusal without end": (raw(b"HTTP/1.1 500 No\r\n\r\n", b"no " * 99_999, is_endless=True),
         silent("http_500", "no no no")),
-    # --- how long to wait
     "nobody: Retry-After 1e18": (error(429, "busy", Retry_After="1e18"), silent("total_timeout",
         "asks to wait 1000000000000000000 s", 1)),
-    # --- bodies
     # dropped for good: the answer was one, and is not paid for twice
     "nobody: thoughts without end": (message(content="<think>" + "a <think> {" * 30_000),
         (NothingKept, "", 3, "structure")),
-    # --- the wire
     "nobody: a bomb of gzip": (lambda body: Sent(200, BOMB, {"Content-Encoding": "gzip"}), silent("connection",
         "the response is compressed")),
     "nobody: a stream without end": (raw(CHUNKED, b"1000\r\n" + b" " * 4096 + b"\r\n", is_endless=True),

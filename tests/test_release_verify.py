@@ -71,7 +71,6 @@ def test_processes_find_what_one_finds(honest, tmp_path):
 @pytest.mark.parametrize(("add", "expected"), [
     (lambda place: place.symlink_to("/etc/hostname"), {"unreadable": 1}),
     (lambda place: write_bytes(place / "more.bin", b"anything"), {"unexpected": 1}),
-    (os.mkfifo, {"unreadable": 1}),
 ])  # fmt: skip
 def test_a_licence_is_a_file_of_the_folder(honest, tmp_path, add, expected):
     folder = shutil.copytree(honest, tmp_path / "release")
