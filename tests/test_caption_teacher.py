@@ -9,7 +9,6 @@ import heapq
 import json
 import logging
 import re
-import socket
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from pathlib import Path
 
 import pytest
 from commands import invoke
+from simulator_serving import free_port
 from specimens_captions import deciding, report_of
 from specimens_captions import settings as quick
 from teacher_server import TeacherServer, is_mirror, refusal
@@ -107,9 +107,7 @@ def test_the_key_reaches_the_header_and_nothing_else(tree, tmp_path, monkeypatch
 
 
 def test_unreachable_and_unknown_model_and_not_an_endpoint(tree, tmp_path):
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     with pytest.raises(TeacherError, match=f"127.0.0.1:{port}/v1: cannot reach the server"):
         run(settings(f"http://127.0.0.1:{port}"), tree, tmp_path / "a")
     with TeacherServer(models=("one", "two")) as server:

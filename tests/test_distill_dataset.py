@@ -51,16 +51,10 @@ def test_which_captions_teach_and_how_much():
         caption = make_caption("Town01", "trajectory_1", variant, 4, **changes)
         return make_sample(caption, language, PrepareConfig(**settings))
 
-    for changes, language, settings, reason in (
-        ({"verdict": "SOFT_CONFLICT"}, "en", {"verdicts": ("CONSISTENT",)}, "verdict_soft_conflict"),
-        ({"checks": checks}, "en", {}, "contradicted"),
-    ):
-        assert made(changes, language, **settings) == reason
-    for changes, language, settings in (
-        ({"verdict": "SOFT_CONFLICT"}, "en", {}),
-        ({"checks": checks}, "zh", {}),
-    ):
-        assert isinstance(made(changes, language, **settings), Sample)
+    assert made({"verdict": "SOFT_CONFLICT"}, verdicts=("CONSISTENT",)) == "verdict_soft_conflict"
+    assert isinstance(made({"verdict": "SOFT_CONFLICT"}), Sample)
+    assert made({"checks": checks}) == "contradicted"
+    assert isinstance(made({"checks": checks}, "zh"), Sample)
     assert made({"label": "hover"}).label == "hover"
     assert made({"label": "hover", "label_from": "perturbed"}, variant="aug_001").label is None  # it is noisy
     dark = made({"depth_range_m": 40.0}, modalities=("depth",))

@@ -174,7 +174,6 @@ def test_a_state_is_the_motion_that_led_to_a_frame():
     assert np.allclose(states(rows), expected)
 
 
-@pytest.mark.slow
 def test_a_flight_with_gaps_is_several_episodes(tmp_path, tmp_path_factory):
     parts = make_release(tmp_path_factory.mktemp("parts"), num_frames=10, window=2, selection="windows")
     product = export(config("lerobot"), parts, tmp_path / "out")
