@@ -40,10 +40,8 @@ def done(tree, tmp_path_factory):
 
 def test_every_window_is_one_line_sorted_and_labelled_from_geometry(tree, done):
     captions = list(read_captions(done / "captions.jsonl"))
-    expected = {}
-    for folder in find_tracks(tree):
-        for sample in cut_windows(read_track(folder), CaptionConfig().window):
-            expected[sample.observed.sample_id] = TABLE.label_of(measure(sample.future))
+    windows = [one for folder in find_tracks(tree) for one in cut_windows(read_track(folder), CaptionConfig().window)]
+    expected = {window.observed.sample_id: TABLE.label_of(measure(window.future)) for window in windows}
     assert [caption.sample_id for caption in captions] == sorted(expected)
     assert {caption.sample_id: caption.label for caption in captions} == expected
     assert len(captions) == 6 * 9

@@ -367,12 +367,11 @@ def test_each_decision_has_a_family_and_each_family_sentences():
 
 def test_both_languages_of_a_sentence_agree():
     for english, chinese in PAIRS:
-        assert sorted(SLOT.findall(english)) == sorted(SLOT.findall(chinese)), english
+        slots = SLOT.findall(english)
+        assert sorted(slots) == sorted(SLOT.findall(chinese)), english
         assert all(zh in chinese for zh in terms_in(SLOT.sub("", english)).values()), english
         assert count_opposites(SLOT.sub("", english), "en") == count_opposites(SLOT.sub("", chinese), "zh"), english
-        assert all(slot in ("decision", "side:decision") or parse_reference(slot) for slot in SLOT.findall(english)), (
-            english
-        )
+        assert all(slot in ("decision", "side:decision") or parse_reference(slot) for slot in slots), english
         assert len(cut_sentences(english)) == len(cut_sentences(chinese)) == 1, english
 
 

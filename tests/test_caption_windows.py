@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from commands import invoke, obeyed
+from specimens_release import all_bytes
 from teacher_server import TeacherServer
 
 from caption.answer_formats.formats import FORMATS, Draft
@@ -93,9 +94,8 @@ def test_changing_all_future_frames_leaves_requests_byte_identical(tree, tmp_pat
     shutil.copytree(tree, spoiled)
     spoil_future(spoiled, current=7)
     for limit, is_same in ((4, True), (5, False)):  # of the window that ends at 8 a frame that is observed was changed
-        before, after = (
-            free_requests(root, tmp_path / f"{root.name}_{limit}", limit, layout) for root in (tree, spoiled)
-        )
+        outs = {root: tmp_path / f"{root.name}_{limit}" for root in (tree, spoiled)}
+        before, after = (free_requests(root, out, limit, layout) for root, out in outs.items())
         assert len(before) == 2 * limit  # English and Chinese
         assert (before == after) is is_same
 
@@ -391,9 +391,7 @@ def test_captions_are_asked_with_them_and_keep_them(tmp_path):
         assert caption.prompt["zh"].system.endswith(OWN_LINE.replace("$$", "$"))
         [line] = [line for line in caption.prompt["en"].user.splitlines() if line.startswith("HEIGHT ")]
         assert " m 100 % $1, " in line
-    assert {p.name: p.read_bytes() for p in (out / OWN_PROMPTS).iterdir()} == {
-        p.name: p.read_bytes() for p in mine.iterdir()
-    }
+    assert all_bytes(out / OWN_PROMPTS) == all_bytes(mine)
     listed = {entry["path"] for entry in json.loads((out / "manifest.json").read_text())["outputs"]}
     assert {f"{OWN_PROMPTS}/{p.name}" for p in mine.iterdir()} <= listed
     with pytest.raises(ResumeError, match="prompts"):

@@ -68,9 +68,8 @@ def asked(tmp_path_factory):
     from caption.stage.stage import run as caption_run
 
     root = tmp_path_factory.mktemp("asked")
-    path = caption_run(
-        CaptionConfig(), make_playback_tree(root / "tree", 1, 12, with_augmented=False), root / "caption"
-    )
+    tree = make_playback_tree(root / "tree", 1, 12, with_augmented=False)
+    path = caption_run(CaptionConfig(), tree, root / "caption")
     return next(caption for caption in read_captions(path) if caption.status == "accepted")
 
 
@@ -99,12 +98,10 @@ def test_a_town_and_its_layered_map_are_in_one_split_and_counts_add_up(tree, cap
     splits = {split: list(open_split(out, split)) for split in SPLITS}
     towns = [{sample.town.removesuffix("_Opt") for sample in found} for found in splits.values()]
     assert sum(map(len, towns)) == len(set.union(*towns)) == 2
-    manifest = json.loads((out / "manifest.json").read_text())
+    manifest, sizes = json.loads((out / "manifest.json").read_text()), {name: len(own) for name, own in splits.items()}
     # Flights, variants, windows, languages.
-    assert manifest["counts"]["kept"] == sum(map(len, splits.values())) == 5 * 2 * 4 * 2
-    assert {split: facts["samples"] for split, facts in manifest["splits"].items()} == {
-        split: len(samples) for split, samples in splits.items()
-    }
+    assert manifest["counts"]["kept"] == sum(sizes.values()) == 5 * 2 * 4 * 2
+    assert {split: facts["samples"] for split, facts in manifest["splits"].items()} == sizes
 
 
 def test_a_sample_has_the_past_of_its_own_frames(tree, captions, tmp_path):
@@ -265,13 +262,12 @@ def test_a_bad_flight_stops_no_other(tmp_path, four_walks):
 
 
 def test_no_walk_is_in_two_splits(windows_of_tracks):
-    walks = [{sample.walk for sample in found} for found in samples(windows_of_tracks).values()]
+    splits = samples(windows_of_tracks)
+    walks = [{sample.walk for sample in found} for found in splits.values()]
     assert all(walks)
     assert sum(map(len, walks)) == len(set.union(*walks)) == 4
-    splits = json.loads((windows_of_tracks / "manifest.json").read_text())["splits"]
-    assert {split: facts["samples"] for split, facts in splits.items()} == {
-        split: len(found) for split, found in samples(windows_of_tracks).items()
-    }
+    told = json.loads((windows_of_tracks / "manifest.json").read_text())["splits"]
+    assert {name: facts["samples"] for name, facts in told.items()} == {name: len(own) for name, own in splits.items()}
 
 
 NUM_POINTS = 9

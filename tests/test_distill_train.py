@@ -329,9 +329,8 @@ def test_two_processes_give_what_one_gives(place, alone, tmp_path):
     for mine, other in zip(log_of(tmp_path / "out", "validation"), log_of(alone, "validation"), strict=True):
         found, wanted = ({n: v for n, v in each["validation"].items() if v is not None} for each in (mine, other))
         assert found == pytest.approx(wanted, rel=1e-5)
-    adapters = [
-        safetensors.load_file(out / "adapter" / "adapter_model.safetensors") for out in (tmp_path / "out", alone)
-    ]
+    name = "adapter/adapter_model.safetensors"
+    adapters = [safetensors.load_file(out / name) for out in (tmp_path / "out", alone)]
     for name, tensor in adapters[0].items():
         assert np.allclose(tensor, adapters[1][name], atol=1e-4), name
     manifests = [json.loads((out / "manifest.json").read_text()) for out in (tmp_path / "out", alone)]
