@@ -103,10 +103,9 @@ def test_the_total_timeout_bounds_all_tries(tree, tmp_path, monkeypatch):
     monkeypatch.setattr(client, "LONGEST_PAUSE_S", 0.3)
     monkeypatch.setattr(client, "TOTAL_TIMEOUT_S", 0.5)
     monkeypatch.setattr(asking, "STOP_AFTER_FAILURES", 1)
-    endpoint = {"max_tries": 50}
     with deciding(fault=lambda number, body: "500") as server:
         with pytest.raises(TeacherError, match="total_timeout"):
-            run(settings(server.url, endpoint=endpoint, limit=1), tree, tmp_path / "out")
+            run(settings(server.url, endpoint={"max_tries": 50}, limit=1), tree, tmp_path / "out")
         assert 1 <= len(server.bodies) <= 4
 
 

@@ -181,18 +181,14 @@ def test_running_again_changes_nothing(small_run):
     assert {p: p.stat().st_mtime_ns for p in before} == before
 
 
-@pytest.mark.parametrize(("name", "value", "words"), [
-    ("simplify.trunk", "full", "trunk was 'stem', is 'full'"), ("pedestrians.num_paths", 1, "num_paths was 2, is 1"),
-    ("plan.safety_distance_m", 3.5, "safety_distance_m was 3.0, is 3.5"),
-])  # fmt: skip
-def test_other_settings_are_refused_by_name_and_nothing_is_touched(small_run, tmp_path, caplog, name, value, words):
+def test_other_settings_are_refused_by_name_and_nothing_is_touched(small_run, tmp_path, caplog):
     out = begin(small_run, tmp_path / "run", "render")
     before = (out / "run.yaml").read_bytes()
     caplog.set_level("INFO")
-    with pytest.raises(ResumeError, match=words):
-        pipeline.run(tiny(**{name: value}), out)
+    with pytest.raises(ResumeError, match=r"safety_distance_m was 3\.0, is 3\.5"):
+        pipeline.run(tiny(**{"plan.safety_distance_m": 3.5}), out)
     assert (out / "run.yaml").read_bytes() == before
-    assert f"{name.partition('.')[0]}: already complete" not in caplog.text
+    assert "plan: already complete" not in caplog.text
     assert not (out / ".lock").exists(), "who failed holds nobody up"
 
 

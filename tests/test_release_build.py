@@ -188,10 +188,9 @@ def cut(path: Path, num_bytes: int) -> None:
 def other_size(root: Path) -> None:
     """One trajectory of a tree of another size in the place of the first."""
     other = make_playback_tree(root / "other", 1, POINTS, width_px=64, height_px=36)
-    for variant in ("ORI", "aug_001"):
-        target = first_flight(root).parent / variant
-        shutil.rmtree(target)
-        shutil.copytree(next(other.glob(f"*/*/{variant}")), target)
+    target = first_flight(root).parent
+    shutil.rmtree(target)
+    shutil.copytree(next(other.glob("*/*")), target)
 
 
 FIFTH = "frames_playback/frame_00005"
