@@ -240,8 +240,9 @@ def called_complete(root: Path, wholes: list[Path]) -> list[str]:
     for manifest in wholes[0].rglob("manifest.json"):
         folder = manifest.parent.relative_to(wholes[0])
         for product in recorded_digests(manifest.parent):
-            path = root / folder / product
-            if path.exists() and _is_taken(path) and not any(_same(path, whole / folder / product) for whole in wholes):
+            path, others = root / folder / product, [whole / folder / product for whole in wholes]
+            known = [_plain(other) for other in others if other.exists()]
+            if path.exists() and _is_taken(path) and _plain(path) not in known:
                 wrong.append(f"{folder / product} is taken by the next stage")
     for record in wholes[0].rglob("release.json"):
         path = root / record.parent.relative_to(wholes[0])
@@ -249,10 +250,6 @@ def called_complete(root: Path, wholes: list[Path]) -> list[str]:
         if path.is_dir() and verify(path, level="structure").is_ok and contents(path) not in known:
             wrong.append(f"{path.relative_to(root)} verifies")
     return wrong
-
-
-def _same(path: Path, other: Path) -> bool:
-    return other.exists() and _plain(path) == _plain(other)
 
 
 def _is_taken(path: Path) -> bool:

@@ -36,7 +36,7 @@ bench.FITTED_ON = 200
              SMALL_TOWN + "scenes.NUM_WALKS, bench.WALKS = 1, bench.WALKS.model_copy(update={'num_paths': 1})"),
     ("bench_render", "--frames 2", r"CPU ms a frame", SMALL_TOWN),
     ("bench_training", "--batch 1 --steps 1", r'"tokens_per_s": \d'),
-    ("seeing_student", "--language none.gguf --epochs 1 --workers 1 --without none --out OUT RUN/render",
+    ("seeing_student", "--language none.gguf --epochs 1 --without none --out OUT RUN/render",
              r'"target_found": {"trained": [01]\.\d+', """
 bench.VISION.update(hidden_size=32, intermediate_size=32, num_hidden_layers=1, num_attention_heads=2)
 bench.assemble = lambda language, out, tower: None  # needs the weights of SmolLM2

@@ -246,16 +246,11 @@ def test_what_cannot_run_here_is_in_the_documents():
     assert [word for word in SMALL if not any(text.startswith(word) for _, text in ALL)] == [], "in no document"
 
 
-@pytest.fixture
-def room_on_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`doctor` fails on a disk that is nearly full; what this machine has left is not what the documents are about."""
-    usage = shutil.disk_usage(Path.cwd())
-    monkeypatch.setattr(shutil, "disk_usage", lambda place: usage._replace(free=100 * 2**30))
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(3600)  # 4 minutes on a machine that has nothing else to do
-def test_every_command_runs(place, in_this_process, room_on_the_disk):
+def test_every_command_runs(place, in_this_process, monkeypatch):
+    usage = shutil.disk_usage(Path.cwd())  # `doctor` fails on a disk that is nearly full, as this machine's may be
+    monkeypatch.setattr(shutil, "disk_usage", lambda place: usage._replace(free=100 * 2**30))
     failed, pages = [], [*FIRST, *sorted({page for page, _ in ALL} - {*FIRST, *LAST}), *LAST]
     in_order = [(page, text) for wanted in pages for page, text in ALL if page == wanted]
     for page, text in [("commands.md", QUICKSTART), *in_order]:

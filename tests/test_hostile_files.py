@@ -286,11 +286,6 @@ def forged(model: type[BaseModel], honest: BaseModel, least: int) -> BaseModel:
     return model.model_validate(value)
 
 
-@pytest.fixture(scope="module")
-def inspection(tree, tmp_path_factory) -> Path:
-    return inspect(InspectConfig(jerk_rms_max_mps3=1e6), None, None, tree, tmp_path_factory.mktemp("inspected"))
-
-
 def check_page(page: str, honest: str) -> None:
     """Same tags as in the honest page, none of them the forger's; and a policy that would stop them."""
     found = Tags(page)
@@ -303,7 +298,8 @@ def check_page(page: str, honest: str) -> None:
     assert "&lt;script&gt;" in page  # shown, not left out
 
 
-def test_the_page_of_an_inspection_shows_forged_records(inspection):
+def test_the_page_of_an_inspection_shows_forged_records(tree, tmp_path):
+    inspection = inspect(InspectConfig(jerk_rms_max_mps3=1e6), None, None, tree, tmp_path / "inspected")
     honest = read_inspection(inspection)
     false = forged(Inspection, honest, 8)
     check_page(report_html(HOSTILE, false, {}), (inspection.parent / "report.html").read_text(encoding="utf-8"))

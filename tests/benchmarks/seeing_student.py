@@ -172,12 +172,11 @@ def main() -> None:
     parser.add_argument("--language", type=Path, required=True, help="GGUF file of SmolLM2")
     parser.add_argument("--without", nargs="*", default=[], help="towns that are only tested")
     parser.add_argument("--epochs", type=int, default=20)
-    parser.add_argument("--workers", type=int, default=8)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     device = "cuda" if torch.cuda.is_available() else "cpu"
     folders = [folder for tree in arguments.trees for folder in find_tracks(tree)]
-    with ProcessPoolExecutor(arguments.workers) as pool:
+    with ProcessPoolExecutor() as pool:
         read = list(pool.map(frames_of, folders))
     tracks: dict[str, list] = {"trained": [], "other towns": []}
     for folder, pair in zip(folders, read, strict=True):
