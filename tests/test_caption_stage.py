@@ -192,15 +192,12 @@ def test_a_conflict_without_a_reason_for_its_label_counts_as_not_repaired(strate
     assert compare(strategy, trials).consistency == round(len(repaired) / len(trials), 3)
 
 
-def coc(text: str) -> Coc:
-    return Coc(critical_components=text, reasoning_trace="r", flight_decision="hover")
-
-
 def test_a_comparison_by_hand():
+    first = Coc(critical_components="a b c", reasoning_trace="r", flight_decision="hover")
     trials = [
-        Trial(coc("a b c"), coc("a b c"), "CONSISTENT", 1, 100),
-        Trial(coc("a b c"), coc("x y z"), "SOFT_CONFLICT", 2, 200),
-        Trial(coc("a b c"), None, "HARD_CONFLICT", 3, 300),
+        Trial(first, first, "CONSISTENT", 1, 100),
+        Trial(first, first.model_copy(update={"critical_components": "x y z"}), "SOFT_CONFLICT", 2, 200),
+        Trial(first, None, "HARD_CONFLICT", 3, 300),
     ]
     found = compare("hint", trials)
     assert (found.num_conflicts, found.repaired, found.consistency) == (3, 2, 0.333)

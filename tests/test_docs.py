@@ -106,9 +106,8 @@ def test_every_file_of_the_files_page_is_written_by_code():
         r"`([\w./-]+\.(?:json|jsonl|html|png|gif|npy|md|sha256|yaml|pt))`", (ROOT / "docs/files.md").read_text()
     )
     names = {word.rpartition("/")[2] for word in words}
-    elsewhere = {f"{split}.jsonl" for split in ("train", "val", "test")} | {
-        "roi_polygon.json"
-    }  # named by a loop; a user's own
+    # Named by a loop; a user's own.
+    elsewhere = {*(f"{split}.jsonl" for split in ("train", "val", "test")), "roi_polygon.json"}
     assert len(names) > 40
     assert sorted(name for name in names - elsewhere if f'{name}"' not in CODE and f"{name}'" not in CODE) == []
 

@@ -5,7 +5,6 @@ text, pages and cards show it as it is, and no length of it is too long.
 import base64
 import io
 import json
-import random
 import re
 import struct
 import zlib
@@ -13,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
@@ -65,7 +65,6 @@ from specimens import make_playback_tree, map_of, pack_depth
 
 INPUTS = 40  # for each reader
 LONGEST_LINE = 5_000
-Random = random.Random
 
 
 FLIGHT = "tree/Town01/*/ORI"
@@ -313,12 +312,9 @@ def test_the_page_of_a_captioning_run_shows_forged_captions(tree, tmp_path):
     check_page(page, (done / "report.html").read_text(encoding="utf-8") + '<div class="gone"></div>')
 
 
-markdown = MarkdownIt("commonmark", {"html": True}).enable("table")
-
-
 def test_a_card_shows_forged_texts(specimens):
     card = render_card(forged(ReleaseRecord, read_record(specimens / "release/dataset/release.json"), 8))
-    page = markdown.render(card.split("\n---\n", 1)[1])
+    page = MarkdownIt("commonmark", {"html": True}).enable("table").render(card.split("\n---\n", 1)[1])
     assert "alert(1)" in page
     assert not {"script", "img", "a"} & {tag for tag, *_ in Tags(page).seen}
     assert not OBEYED.search(card.replace("\n", ""))
