@@ -111,6 +111,9 @@ def silent(cause: str, words: str = "", num_asked: int = TRIES) -> Outcome:
 
 IMPATIENT = {"timeout_s": 3.0, "max_tries": 1}  # long enough for the list of models on a busy machine
 FAULTS: dict[str, tuple] = {
+    "vLLM: 500, a library of grammars is missing, vllm 16030": (
+        error(500, "xgrammar.so: cannot open shared object file: outlines is not installed either"),
+        silent("http_500")),
     "a gateway: 307 elsewhere, letta 3189": (page(307, "", Location="http://127.0.0.1:1/v1/chat/completions"),
         (TeacherError, "not a chat endpoint", 1, None)),
     "nobody: a refusal without end": (raw(b"HTTP/1.1 500 No\r\n\r\n", b"no " * 99_999, is_endless=True),
