@@ -129,7 +129,7 @@ SHORT = {  # what commands have in common
     "training": " ".join(f"--set distill.train.{setting}" for setting in TRAINING), "maps": "{base}/maps/boxes_3d.json",
     "simple": "{base}/simplify/step2_simplified.json", "walks": "{base}/pedestrians/path.json",
     "traces": "{base}/plan/drone_trace.json", "tree": "{base}/render", "release": "{base}/release/dataset",
-    "towns": "--set 'towns={one: {}, two: {maps: {synthetic: {size_m: 120}}}}'",
+    "towns": "--set 'towns={one: {}, two: {maps: {synthetic: {size_m: 120, num_blocks: 1}}}}'",
     "three": "--map {maps} --simplified {simple} --traces {traces} {tiny}",
     "asked": "--teacher {teacher} --set caption.endpoint.concurrency=1 --no-check {tiny}",
     "set": "--dataset {students}/set --data {students}/tree",
