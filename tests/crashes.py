@@ -167,10 +167,8 @@ def run(work: Callable[[], object], root: Path, die_at: Moment | None = None) ->
         _, status = os.waitpid(child, 0)
     select.select([gone], [], [], GONE_S)
     os.close(gone)
-    lines = trace.read_text().splitlines()
-    return Ended(
-        os.waitstatus_to_exitcode(status), said.read_text(errors="replace"), [Step(*json.loads(line)) for line in lines]
-    )
+    taken = [Step(*json.loads(line)) for line in trace.read_text().splitlines()]
+    return Ended(os.waitstatus_to_exitcode(status), said.read_text(errors="replace"), taken)
 
 
 def _be_child(work: Callable[[], object], watch: _Watch, voice: int) -> None:

@@ -220,10 +220,8 @@ def test_no_label_comes_from_an_order_that_nobody_knows_yet(ordered):
 
 def test_a_mission_reaches_no_request_before_its_order_stands(tree, ordered):
     def users(root):
-        asked = [
-            make_question(w.observed, ImageConfig(), "slots", RELATIVE).asked
-            for w in cut_windows(flight_in(root), NO_IMAGES)
-        ]
+        observed = [window.observed for window in cut_windows(flight_in(root), NO_IMAGES)]
+        asked = [make_question(one, ImageConfig(), "slots", RELATIVE).asked for one in observed]
         return [(prompts["en"].user, prompts["zh"].user) for prompts in asked]
 
     plain, told = users(tree), users(ordered)

@@ -66,10 +66,9 @@ def lines_of(path: Path) -> list[dict]:
 def test_messages_are_what_their_loaders_ask_for(run, tmp_path, shown):
     datasets = pytest.importorskip("datasets")
     product = exported(run, tmp_path / "out", frames=shown)
-    samples = lines_of(product / "train.jsonl")
-    found = datasets.load_dataset(
-        "json", data_files=str(product / "train.jsonl"), split="train", cache_dir=str(tmp_path / "cache")
-    )
+    train = product / "train.jsonl"
+    samples = lines_of(train)
+    found = datasets.load_dataset("json", data_files=str(train), split="train", cache_dir=str(tmp_path / "cache"))
     assert len(found) == len(samples) == 2 * len(accepted(run))
     for sample, loaded in zip(samples, found, strict=True):
         assert [turn["role"] for turn in loaded["messages"]] == ["user", "assistant"]
