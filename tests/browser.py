@@ -40,9 +40,8 @@ class Page:
 
     def send(self, method: str, **params: Any) -> dict:
         self.number += 1
-        message = {"id": self.number, "method": method, "params": params} | (
-            {"sessionId": self.session} if self.session else {}
-        )
+        message = {"id": self.number, "method": method, "params": params}
+        message |= {"sessionId": self.session} if self.session else {}
         os.write(self.pipes[0], json.dumps(message).encode() + b"\0")
         while True:
             got = self._next()

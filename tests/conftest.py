@@ -49,11 +49,8 @@ def in_this_process() -> Iterator[None]:
         yield
 
 
-Make = Callable[[Path], object]
-
-
 @pytest.fixture(scope="session")
-def built_once(tmp_path_factory) -> Callable[[str, Make], Path]:
+def built_once(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
     """Return a function that gives a directory by its name; the first worker of the session that asks fills it.
 
     What is in it is read by many tests; what a test writes has a directory of its own.
@@ -61,7 +58,7 @@ def built_once(tmp_path_factory) -> Callable[[str, Make], Path]:
     base = tmp_path_factory.getbasetemp()
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
-    def give(name: str, make: Make) -> Path:
+    def give(name: str, make: Callable[[Path], object]) -> Path:
         folder, finished = base / "built_once" / name, base / "built_once" / f"{name}.finished"
         folder.parent.mkdir(exist_ok=True)
         with FileLock(f"{folder}.lock"):

@@ -9,7 +9,6 @@ It is a process of its own: what it kills are forks, and a fork of a process tha
 
 import argparse
 import importlib
-import json
 import pkgutil
 import shlex
 import shutil
@@ -20,7 +19,6 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from zlib import crc32
 
 from crashes import run, sweep
 
@@ -98,12 +96,8 @@ def _chat_server(place: Place):
 
 
 def _judge(place: Place) -> str:
-    from caption.teachers.judge import JUDGEMENTS
-
     server = _chat_server(place)
-    server.text = lambda body: json.dumps(
-        {"verdict": JUDGEMENTS[crc32(json.dumps(body["messages"]).encode()) % len(JUDGEMENTS)], "reason": "because"}
-    )
+    server.text = lambda body: '{"verdict": "REJECT_REGEN", "reason": "because"}'
     return server.url
 
 
@@ -135,7 +129,7 @@ SHORT = {  # what commands have in common
     "training": " ".join(f"--set distill.train.{setting}" for setting in TRAINING), "maps": "{base}/maps/boxes_3d.json",
     "simple": "{base}/simplify/step2_simplified.json", "walks": "{base}/pedestrians/path.json",
     "traces": "{base}/plan/drone_trace.json", "tree": "{base}/render", "release": "{base}/release/dataset",
-    "towns": "--set 'towns={one: {}, two: {maps: {synthetic: {size_m: 120}}}}'",
+    "towns": "--set 'towns={one: {}, two: {maps: {synthetic: {size_m: 120, num_blocks: 1}}}}'",
     "three": "--map {maps} --simplified {simple} --traces {traces} {tiny}",
     "asked": "--teacher {teacher} --set caption.endpoint.concurrency=1 --no-check {tiny}",
     "set": "--dataset {students}/set --data {students}/tree",
@@ -143,18 +137,9 @@ SHORT = {  # what commands have in common
 }  # fmt: skip
 
 
-def copy_stage(place: Place, out: Path, stage: str) -> None:
-    shutil.copytree(f"{place.given('base')}/{stage}", out, dirs_exist_ok=True)
-
-
-def lose_release(_: Place, out: Path) -> None:
-    """Make of a finished run of towns one of which only the release is left to do."""
-    shutil.rmtree(out / "release")
-
-
 # Commands by name; {out} is what is watched, other braces are SHORT and INPUTS. Several: one after the other in the
 # same folder; a function is what comes before.
-COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
+COMMANDS: dict[str, list[str | Callable[[Place, Path], object]]] = {
     "maps": ["maps --out {out} {tiny}"],
     "maps carla": ["maps --source carla --set maps.carla.port={carla} --out {out}"],
     "maps unrealcv": ["maps --source unrealcv --set maps.unrealcv.port={unrealcv} --out {out}"],
@@ -183,7 +168,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "view frame": ["view {tree} --out {out}/sample.png --frame best --map {maps}"],
     "inspect": ["inspect --map {simple} --traces {traces} --data {tree} --out {out} {tiny}"],
     "inspect review": [
-        lambda place, out: copy_stage(place, out, "inspect"),
+        lambda place, out: shutil.copytree(f"{place.given('base')}/inspect", out, dirs_exist_ok=True),
         "inspect review --inspect {out} --reject {track} --by somebody --reason 'too near'",
     ],
     "reproduce": ["reproduce {base} --out {out} --pedestrians 1 --workers 1"],
@@ -221,7 +206,9 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     ],
     "run": ["run quickstart --out {out} {tiny}"],
     "run, towns": ["run quickstart --out {out} {tiny} {towns}"],
-    "run, towns, release": ["run quickstart --out {out} {tiny} {towns}", lose_release, "run {out}"],
+    "run, towns, release": [  # the release alone is left to do
+        "run quickstart --out {out} {tiny} {towns}", lambda _, out: shutil.rmtree(out / "release"), "run {out}"
+    ],
 }  # fmt: skip
 
 
@@ -235,7 +222,7 @@ def words_of(text: str, place: Place, out: Path) -> list[str]:
     return shlex.split(text.replace("{out}", str(out)))
 
 
-def works(name: str, place: Place) -> list[Callable[[], None]]:
+def works(name: str, place: Place) -> list[Callable[[], object]]:
     out = place.root / "out"
     return [
         partial(given, place, out) if callable(given) else partial(command, words_of(given, place, out))

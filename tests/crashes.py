@@ -95,11 +95,7 @@ class _Watch:
 
         def watched_write(data: Any) -> Any:
             def half() -> None:
-                write(
-                    memoryview(data).cast("B")[: memoryview(data).nbytes // 2]
-                    if "b" in opened.mode
-                    else data[: len(data) // 2]
-                )
+                write(data[: len(data) // 2])
                 opened.flush()
 
             self._step("write", path, half)
@@ -171,10 +167,8 @@ def run(work: Callable[[], object], root: Path, die_at: Moment | None = None) ->
         _, status = os.waitpid(child, 0)
     select.select([gone], [], [], GONE_S)
     os.close(gone)
-    lines = trace.read_text().splitlines()
-    return Ended(
-        os.waitstatus_to_exitcode(status), said.read_text(errors="replace"), [Step(*json.loads(line)) for line in lines]
-    )
+    taken = [Step(*json.loads(line)) for line in trace.read_text().splitlines()]
+    return Ended(os.waitstatus_to_exitcode(status), said.read_text(errors="replace"), taken)
 
 
 def _be_child(work: Callable[[], object], watch: _Watch, voice: int) -> None:
@@ -244,8 +238,9 @@ def called_complete(root: Path, wholes: list[Path]) -> list[str]:
     for manifest in wholes[0].rglob("manifest.json"):
         folder = manifest.parent.relative_to(wholes[0])
         for product in recorded_digests(manifest.parent):
-            path = root / folder / product
-            if path.exists() and _is_taken(path) and not any(_same(path, whole / folder / product) for whole in wholes):
+            path, others = root / folder / product, [whole / folder / product for whole in wholes]
+            known = [_plain(other) for other in others if other.exists()]
+            if path.exists() and _is_taken(path) and _plain(path) not in known:
                 wrong.append(f"{folder / product} is taken by the next stage")
     for record in wholes[0].rglob("release.json"):
         path = root / record.parent.relative_to(wholes[0])
@@ -253,10 +248,6 @@ def called_complete(root: Path, wholes: list[Path]) -> list[str]:
         if path.is_dir() and verify(path, level="structure").is_ok and contents(path) not in known:
             wrong.append(f"{path.relative_to(root)} verifies")
     return wrong
-
-
-def _same(path: Path, other: Path) -> bool:
-    return other.exists() and _plain(path) == _plain(other)
 
 
 def _is_taken(path: Path) -> bool:

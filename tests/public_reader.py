@@ -15,13 +15,8 @@ from PIL import Image
 TRACES = ("ORI", "aug_001")
 
 
-class Refused(Exception):
-    """The tree is not what the reader takes; says where and why."""
-
-
 def need(condition: Any, where: object, what: str) -> None:
-    if not condition:
-        raise Refused(f"{where}: {what}")
+    assert condition, f"{where}: {what}"
 
 
 def read_public(root: Path, *, exported: bool = False) -> dict[str, dict[str, dict]]:

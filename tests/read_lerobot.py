@@ -19,7 +19,6 @@ if torch.version.cuda is None:
         library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 
 import torchvision
-from lerobot.datasets import lerobot_dataset, utils
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 
@@ -58,16 +57,12 @@ torchvision.io.VideoReader = VideoReader
 
 
 def main(root: str, *indices: str) -> None:
-    if not indices:
-        constants = {"version": lerobot_dataset.CODEBASE_VERSION, "chunk": utils.DEFAULT_CHUNK_SIZE}
-        constants |= {"data": utils.DEFAULT_DATA_PATH, "episodes": utils.DEFAULT_EPISODES_PATH}
-        constants |= {"video": utils.DEFAULT_VIDEO_PATH, "defaults": sorted(utils.DEFAULT_FEATURES)}
-        first = LeRobotDataset("cosfly/flights", root=root, video_backend="pyav")[0]
-        print("LOOK " + json.dumps(constants | {"picture": list(first["observation.images.rgb"].shape)}))
-        return
-    data = LeRobotDataset("cosfly/flights", root=root)
+    given = {"repo_id": "cosfly/flights", "root": root, "video_backend": "pyav"}
+    data = LeRobotDataset(**given)
     stats = {name: {kind: values.tolist() for kind, values in one.items()} for name, one in data.meta.stats.items()}
-    windows = LeRobotDataset("cosfly/flights", root=root, delta_timestamps={"observation.state": [-0.5, 0.0]})
+    windows = LeRobotDataset(
+        "cosfly/flights", root=root, video_backend="pyav", delta_timestamps={"observation.state": [-0.5, 0.0]}
+    )
     batch = next(iter(torch.utils.data.DataLoader(data, batch_size=4, shuffle=False)))
     told = {
         "frames": len(data), "episodes": data.meta.total_episodes, "fps": data.meta.fps,

@@ -7,10 +7,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from release_tampering import depth_of, pixels_of, png, set_depth
+from release_tampering import depth_of, set_depth
 
+from cosfly.formats.frames import rgb_bytes
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
-from cosfly.geometry.axes import box_corners, project, world_from_camera
+from cosfly.geometry.axes import box_corners, mask_box, project, world_from_camera
+from cosfly.runtime.png import colours_of
 
 Row = dict[str, Any]
 Rows = list[Row]
@@ -123,26 +125,15 @@ def with_depth(of: Callable[[np.ndarray, Row], np.ndarray]) -> Callable[[Row], N
     return changed
 
 
-def with_ids(of: Callable[[np.ndarray, np.ndarray], Any], *, box: bool = False) -> Callable[[Row], None]:
-    """Change a mask in place: (h, w, 3) and its ids (h, w). box: of the person's pixels anew."""
+def with_ids(of: Callable[[np.ndarray, np.ndarray], Any]) -> Callable[[Row], None]:
+    """Change a mask in place: (h, w, 3) and its ids (h, w)."""
 
     def changed(row: Row) -> None:
-        pixels = pixels_of(row, "instance")
+        pixels = colours_of(row["instance"]["bytes"], "x").copy()
         of(pixels, pixels[..., 1].astype(int) | pixels[..., 2].astype(int) << 8)
-        row["instance"]["bytes"] = png(pixels)
-        if box:
-            row["target_mask_bbox"] = box_of_person(pixels)
+        row["instance"]["bytes"] = rgb_bytes(pixels)
 
     return changed
-
-
-def box_of_person(pixels: np.ndarray) -> dict[str, float] | None:
-    """Give `target_mask_bbox` of an instance image."""
-    rows, columns = np.nonzero((pixels[..., 1] == 255) & (pixels[..., 2] == 255))
-    if not len(rows):
-        return None
-    edges = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
-    return dict(zip(BOX, map(float, edges), strict=True))
 
 
 def another_camera(row: Row) -> None:
@@ -191,8 +182,11 @@ def ids_exchanged(pixels: np.ndarray, ids: np.ndarray) -> None:
     pixels[..., 1], pixels[..., 2] = new & 255, new >> 8
 
 
-def second_person(pixels: np.ndarray, ids: np.ndarray) -> None:
+def second_person(row: Row) -> None:
+    pixels = colours_of(row["instance"]["bytes"], "x").copy()
     pixels[-4:, -4:] = (12, 255, 255)
+    row["instance"]["bytes"] = rgb_bytes(pixels)
+    row["target_mask_bbox"] = dict(zip(BOX, mask_box((pixels[..., 1:] == 255).all(axis=-1)).tolist(), strict=True))
 
 
 not_hovering = first(captioned, lambda row: row["decision"] != "hover")
@@ -238,11 +232,11 @@ LIES_OF_PIXELS: dict[str, Lie] = {
     "depth_in_centimetres_called_lossless": change(clean, with_depth(lambda depth, _: np.round(depth, 2))),
     "depth_set_off": change(everything, with_depth(lambda depth, _: depth + 0.3)),
     "empty_instances": change(at(seen, 2), with_ids(lambda pixels, _: pixels.fill(0))),
-    "second_person_far_away": change(middle_seen, with_ids(second_person, box=True)),
+    "second_person_far_away": change(middle_seen, second_person),
     "ids_of_things_exchanged": ids_of_things_exchanged,
     "jpeg_under_a_png_name": change(
         at(clean, 2),
-        lambda r: r["image"].update(bytes=cv2.imencode(".jpg", pixels_of(r, "image"))[1].tobytes()),
+        lambda r: r["image"].update(bytes=cv2.imencode(".jpg", colours_of(r["image"]["bytes"], "x"))[1].tobytes()),
     ),
 }  # fmt: skip
 # name -> the lie, and whether only pixels tell it

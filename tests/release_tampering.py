@@ -9,7 +9,6 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -139,11 +138,3 @@ def depth_of(row: Row) -> np.ndarray:
 
 def set_depth(row: Row, depth: np.ndarray) -> None:
     row["depth"] = depth_bytes(depth)
-
-
-def png(pixels: np.ndarray) -> bytes:
-    return cv2.imencode(".png", pixels[..., ::-1])[1].tobytes()
-
-
-def pixels_of(row: Row, column: str) -> np.ndarray:
-    return cv2.imdecode(np.frombuffer(row[column]["bytes"], np.uint8), cv2.IMREAD_COLOR)[..., ::-1].copy()

@@ -63,18 +63,16 @@ class TeacherServer:
         models: tuple[str, ...] = (MODEL,),
         decision: Callable[[dict], str] | None = None,
         respond: Callable[[dict], tuple[int, dict] | Sent | Wild | None] | None = None,
-        model_facts: dict | None = None,
         list_models: Callable[[], Sent | Wild | None] | None = None,
     ) -> None:
         """
         Args:
             respond: gives status and body of an answer instead of ours; None: ours.
-            model_facts: what the list of models says about each, beside its name.
             list_models: gives what is sent in place of that list; None: the list.
         """
         self.fault, self.models = fault or (lambda number, body: None), models
         self.decision = decision or (lambda body: TOKENS[body.get("seed", 0) % len(TOKENS)])
-        self.respond, self.model_facts, self.list_models = respond, model_facts or {}, list_models
+        self.respond, self.list_models = respond, list_models
         self.text: Callable[[dict], str] | None = None  # answers with any text at all, for instance a judge's
         self.bodies: list[bytes] = []
         self.headers: list[dict[str, str]] = []
@@ -154,7 +152,7 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
             if sent is not None:
                 self._send_anything(sent)
             elif self.path == "/v1/models":
-                entries = [{"id": name, "object": "model", **server.model_facts} for name in server.models]
+                entries = [{"id": name, "object": "model"} for name in server.models]
                 self._send(200, {"object": "list", "data": entries})
             else:
                 self._send(404, {"error": {"message": f"no such path {self.path}"}})

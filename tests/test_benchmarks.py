@@ -24,15 +24,12 @@ plain = bench.load
 bench.load = lambda model, path, told: plain(model, path, [*told, "pedestrians.num_paths=1"])
 bench.FITTED_ON = 200
 """),
-    ("bench_client", "--windows 40 --concurrency 8", r"encoded before .* requests/s"),
     ("bench_flying", "", r"2 side by side: .* steps a second",
              "bench.NUM_DECISIONS = 4"),
     ("bench_planning", "--planners track_astar muco", r"muco \| \d+ \| 1 of 1",
              SMALL_TOWN + "scenes.NUM_WALKS, bench.WALKS = 1, bench.WALKS.model_copy(update={'num_paths': 1})"),
-    ("bench_release", "8 --rounds 1", r"build: \d+ % of the speed of the copy",
-             "bench.NUM_POINTS, bench.NUM_POOL, bench.FRAMES_RELEASED, bench.SIZE_PX = 8, 1, 4, (160, 90)"),
     ("bench_training", "--batch 1 --steps 1", r'"tokens_per_s": \d'),
-    ("seeing_student", "--language none.gguf --epochs 1 --workers 1 --without none --out OUT RUN/render",
+    ("seeing_student", "--language none.gguf --epochs 1 --without none --out OUT RUN/render",
              r'"target_found": {"trained": [01]\.\d+', """
 bench.VISION.update(hidden_size=32, intermediate_size=32, num_hidden_layers=1, num_attention_heads=2)
 bench.assemble = lambda language, out, tower: None  # needs the weights of SmolLM2

@@ -1,6 +1,7 @@
 """Captions of somebody else: files, and a student behind a server, asked as it was taught, to the byte."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from cosfly.inspection.settings import InspectConfig
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE, read_chat_format, write_chat_format
 from cosfly.runtime.errors import ConfigError, InputError
 from distill.inference import stage as infer
-from distill.schema import Sample, open_split
+from distill.schema import open_split
 from distill.training.stage import chat_format_of
 from release.build import stage as package
 from release.build.sources import Source
@@ -93,7 +94,7 @@ def test_what_is_wrong_with_a_caption_drops_its_window(tree, rules, tmp_path, ch
 
 
 BAD = [
-    ('{"sample_id": "a"}', "en"), ("[1]", ":2"), ("{broken", ":2"),
+    ('{"sample_id": "a"}', "en"), ("[1]", ""), ("{broken", ""),
     ('{"sample_id": "a", "en": {"critical_components": 7}}', "en.critical_components"),
     (json.dumps({"sample_id": "a", "en": EN | {"flight_decision": "hover"}, "colour": "red"}), "colour"),
     (json.dumps({"sample_id": "first", "en": EN | {"flight_decision": "hover"}}), "sample_id"),
@@ -105,10 +106,8 @@ def test_a_bad_line_names_file_line_and_field(tmp_path, text, field):
     path = tmp_path / "theirs.jsonl"
     good = json.dumps({"sample_id": "first", "en": EN | {"flight_decision": "hover"}})
     path.write_text(f"{good}\n{text}\n")
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=f"{re.escape(str(path))}:2.*{re.escape(field)}"):
         read_foreign(path)
-    assert f"{path}:2" in str(caught.value)
-    assert field in str(caught.value)
 
 
 def test_from_a_students_answers_to_a_release(tree, rules, tmp_path):
@@ -138,7 +137,7 @@ def place(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("students")
     tree = make_playback_tree(root / "tree", 3, 14)
     captions = run(CaptionConfig.model_validate({"image": {"max_side_px": SIDE_PX}}), tree, root / "rules")
-    prepared(tree, captions, root / "set", modalities=("rgb", "depth"))
+    prepared(tree, captions, root / "set", modalities=("rgb", "depth"), val_fraction=0, test_fraction=0)
     (root / "trained" / "adapter").mkdir(parents=True)
     write_chat_format(root / "trained" / "adapter", chat_format_of(open_split(root / "set", "train"), MAX_PIXELS))
     return root
@@ -158,29 +157,20 @@ def settings(url: str, folder: Path, **changes: Any) -> CaptionConfig:
     })  # fmt: skip
 
 
-def infer_all(place: Path, url: str, out: Path, **changes: Any) -> list[Sample]:
-    samples: list[Sample] = []
-    for split in ("train", "val", "test"):
-        cfg = infer.InferConfig.model_validate({
-            "split": split, "engine": "endpoint", "max_pixels": MAX_PIXELS, "endpoint": {"timeout_s": 60.0}, **changes,
-        })  # fmt: skip
-        infer.run(cfg, place / "set", [place / "tree"], url, out / split)
-        samples += open_split(place / "set", split)
-    return samples
-
-
 @pytest.mark.parametrize("constrained", [False, True])
 def test_requests_are_those_of_infer_to_the_byte(place, tmp_path, constrained):
     decide = label_of(place)
     with TeacherServer(decision=decide) as server:
-        samples = infer_all(place, server.url, tmp_path / "infer", constrained=constrained)
-        asked = set(server.bodies)
+        cfg = {"split": "train", "engine": "endpoint", "max_pixels": MAX_PIXELS, "endpoint": {"timeout_s": 60.0}}
+        asking = infer.InferConfig.model_validate(cfg | {"constrained": constrained})
+        infer.run(asking, place / "set", [place / "tree"], server.url, tmp_path / "infer")
+        asked, samples = set(server.bodies), open_split(place / "set", "train")
         assert len(asked) == len(samples) == len(server.bodies)
         assert {sample.language for sample in samples} == {"en", "zh"}
         server.bodies.clear()
         student = {"folder": place / "trained", "constrained": constrained}
-        cfg = settings(server.url, place / "trained", student=student)
-        captions = list(read_captions(run(cfg, place / "tree", tmp_path / "captions")))
+        own = settings(server.url, place / "trained", student=student)
+        captions = list(read_captions(run(own, place / "tree", tmp_path / "captions")))
         windows = {sample.sample_id for sample in samples}
         assert windows <= {caption.sample_id for caption in captions}
         assert asked <= set(server.bodies)  # and further windows, which the training set left out

@@ -8,8 +8,7 @@ import asyncio
 import heapq
 import json
 import logging
-import math
-import socket
+import re
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from pathlib import Path
 
 import pytest
 from commands import invoke
+from simulator_serving import free_port
 from specimens_captions import deciding, report_of
 from specimens_captions import settings as quick
 from teacher_server import TeacherServer, is_mirror, refusal
@@ -107,9 +107,7 @@ def test_the_key_reaches_the_header_and_nothing_else(tree, tmp_path, monkeypatch
 
 
 def test_unreachable_and_unknown_model_and_not_an_endpoint(tree, tmp_path):
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     with pytest.raises(TeacherError, match=f"127.0.0.1:{port}/v1: cannot reach the server"):
         run(settings(f"http://127.0.0.1:{port}"), tree, tmp_path / "a")
     with TeacherServer(models=("one", "two")) as server:
@@ -145,9 +143,9 @@ def test_the_limit_on_concurrency_halves_and_recovers():
     for _ in range(4):
         limit.succeeded(is_quick=False)
     assert limit.limit == 2  # until a quick answer
-    for _ in range(70):
+    for expected in (*range(3, 65), 64):  # one more per answer, so that it doubles per round
         limit.succeeded(is_quick=True)
-    assert limit.limit == 64
+        assert limit.limit == expected
     now_s = time.monotonic()
     limit.was_busy(sent_s=now_s, retry_after_s=None)
     limit.was_busy(sent_s=now_s, retry_after_s=None)  # sent before the decrease: does not count again
@@ -163,9 +161,11 @@ def test_the_limit_on_concurrency_halves_and_recovers():
     assert limit.limit == 64
 
 
-def waits_of(limit: ConcurrencyLimit, num_slots: int, answer_s: float, timeout_s: float) -> tuple[list[float], float]:
-    """Return how long 500 answers take, waits in the server's queue included, and when the limit is reached."""
-    free_s, in_flight, waits, now_s, full_s = [0.0] * num_slots, [], [], 0.0, math.inf
+@pytest.mark.parametrize(("num_slots", "answer_s"), [(1, 1.0), (1, 5.0), (1, 30.0), (1, 55.0), (4, 20.0)])
+def test_no_request_times_out_in_the_queue_of_a_small_server(num_slots, answer_s):
+    """500 answers, waits in the server's queue included."""
+    limit, timeout_s = ConcurrencyLimit(256), 120.0
+    free_s, in_flight, waits, now_s = [0.0] * num_slots, [], [], 0.0
     while len(waits) < 500:
         while len(in_flight) < int(limit.limit):
             end_s = max(now_s, heapq.heappop(free_s)) + answer_s
@@ -174,22 +174,7 @@ def waits_of(limit: ConcurrencyLimit, num_slots: int, answer_s: float, timeout_s
         now_s, sent_s = heapq.heappop(in_flight)
         waits.append(now_s - sent_s)
         limit.succeeded(waits[-1] < HEADROOM * timeout_s)
-        if limit.limit == limit.ceiling:
-            full_s = min(full_s, now_s)
-    return waits, full_s
-
-
-@pytest.mark.parametrize(("num_slots", "answer_s"), [(1, 1.0), (1, 5.0), (1, 30.0), (1, 55.0), (4, 20.0)])
-def test_no_request_times_out_in_the_queue_of_a_small_server(num_slots, answer_s):
-    waits, _ = waits_of(ConcurrencyLimit(256), num_slots, answer_s, timeout_s=120.0)
-    assert max(waits) < 120.0
-
-
-@pytest.mark.parametrize("num_slots", [64, 256])
-def test_all_slots_of_a_large_server_are_soon_in_use(num_slots):
-    waits, full_s = waits_of(ConcurrencyLimit(num_slots), num_slots, 1.0, timeout_s=120.0)
-    assert max(waits) == 1.0
-    assert full_s <= math.log2(num_slots)
+    assert max(waits) < timeout_s
 
 
 def test_a_retry_after_holds_every_request():
@@ -261,9 +246,8 @@ def test_what_is_the_servers_fault_ends_the_run_and_is_no_windows(small_tree, tm
     out = tmp_path / "out"
     with deciding() as server:
         server.respond = refusing(server, status, text)
-        with pytest.raises(TeacherError) as caught:
+        with pytest.raises(TeacherError, match=re.escape(text)) as caught:
             run(quick(server.url), small_tree, out)
-        assert text in str(caught.value)
         assert words in str(caught.value)
         assert len(server.bodies) < 30  # no window is asked in vain for long
         assert not (out / "manifest.json").exists()
@@ -283,9 +267,8 @@ def test_a_server_that_refuses_every_window_ends_the_run_and_retry_failed_asks_a
         # One good answer, whose mirror may come between the refusals: three in a row are left whatever the order.
         server.respond = refusing(server, 400, NOT_KNOWN, num_good=1)
         cfg = quick(server.url, endpoint={"concurrency": 1})
-        with pytest.raises(TeacherError) as caught:
+        with pytest.raises(TeacherError, match=NOT_KNOWN):
             run(cfg, small_tree, out)
-        assert NOT_KNOWN in str(caught.value)
         assert not (out / "manifest.json").exists()
         assert {held["code"] for held in quarantine(out).values()} == {"refused_400"}
         server.respond = None  # it is mended
@@ -354,19 +337,16 @@ def test_what_a_model_declined_is_asked_again(small_tree, tmp_path, whole):
         for retry_failed in (False, True):
             with pytest.raises(NothingKept, match=r"10 declined: the model declined to answer"):
                 run(quick(server.url), small_tree, out, retry_failed=retry_failed)
+            assert message["refusal"] in report_of(out)["refusals"]["declined"]
         answer = None
         assert run(quick(server.url), small_tree, out, retry_failed=True).read_bytes() == whole[0]
 
 
-@pytest.mark.parametrize(("status", "text"), [
-    (400, "This response_format type is unavailable now"), (422, "response_format.type `json_schema` is unavailable now"),
-    (200, "response_format is not supported by this provider"),
-])  # fmt: skip
-def test_a_server_that_refuses_the_schema_is_asked_without_it(small_tree, tmp_path, status, text):
-    with deciding(respond=lambda body: refusal(status, text) if "response_format" in body else None) as server:
-        path = run(
-            quick(server.url, limit=4, endpoint={"concurrency": 1, "max_tries": 1}), small_tree, tmp_path / "out"
-        )
+def test_a_server_that_refuses_the_schema_is_asked_without_it(small_tree, tmp_path):
+    refused = refusal(200, "response_format is not supported by this provider")
+    with deciding(respond=lambda body: refused if "response_format" in body else None) as server:
+        cfg = quick(server.url, limit=4, endpoint={"concurrency": 1, "max_tries": 1})
+        path = run(cfg, small_tree, tmp_path / "out")
     assert sum(b"response_format" in body for body in server.bodies) == 1
     assert len(server.bodies) == 8 + 1
     assert [caption.teacher.structured for caption in read_captions(path)] == ["plain"] * 4

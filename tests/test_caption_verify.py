@@ -337,7 +337,6 @@ def test_each_number_is_read_with_the_words_around_it():
 
 
 SLOT = re.compile(r"\{([^{}]*)\}")
-FIELDS = ("critical_components", "reasoning_trace")
 PAIRS = [
     pair
     for parts in sentences().values()
@@ -345,10 +344,6 @@ PAIRS = [
     for group in groups.values()
     for pair in group.smooth
 ]
-
-
-def opposites_in(text, language):
-    return count_opposites(SLOT.sub("", text), language)
 
 
 @pytest.fixture(scope="module")
@@ -372,12 +367,11 @@ def test_each_decision_has_a_family_and_each_family_sentences():
 
 def test_both_languages_of_a_sentence_agree():
     for english, chinese in PAIRS:
-        assert sorted(SLOT.findall(english)) == sorted(SLOT.findall(chinese)), english
+        slots = SLOT.findall(english)
+        assert sorted(slots) == sorted(SLOT.findall(chinese)), english
         assert all(zh in chinese for zh in terms_in(SLOT.sub("", english)).values()), english
-        assert opposites_in(english, "en") == opposites_in(chinese, "zh"), english
-        assert all(slot in ("decision", "side:decision") or parse_reference(slot) for slot in SLOT.findall(english)), (
-            english
-        )
+        assert count_opposites(SLOT.sub("", english), "en") == count_opposites(SLOT.sub("", chinese), "zh"), english
+        assert all(slot in ("decision", "side:decision") or parse_reference(slot) for slot in slots), english
         assert len(cut_sentences(english)) == len(cut_sentences(chinese)) == 1, english
 
 
@@ -390,7 +384,7 @@ def test_a_caption_has_few_facts_a_reason_and_known_values(facts):
         english, chinese = answer
         assert english["flight_decision"] == chinese["flight_decision"]
         assert english["flight_decision"] in ranked(one)
-        for name in FIELDS:
+        for name in ("critical_components", "reasoning_trace"):
             assert len(cut_sentences(english[name])) == len(cut_sentences(chinese[name]))
             for slot in set(SLOT.findall(english[name])) - {"decision", "side:decision"}:
                 assert isinstance(look_up(parse_reference(slot), one), Fact), slot
@@ -405,28 +399,14 @@ def test_a_shaken_track_tells_no_motion_in_numbers(facts):
         assert not re.search(r"\{(change:|mean:target_speed|mean:speed|yaw\})", " ".join(english.values()))
 
 
-def test_captions_are_one_record_in_two_languages(facts):
-    written = [(one, write_answers(one, np.random.default_rng(i))) for i, one in enumerate(facts)]
-    captions = [(one, *answers) for one, answers in written if answers is not None]
-    for one, english, chinese in captions:
-        assert check_mirror(english, chinese, one) is None
-    # A digit of the Chinese text altered to a value that nothing measured is caught.
-    with_numbers = [row for row in captions if re.search(r"\d+\.\d+", row[2].critical_components)]
-    assert len(with_numbers) >= 40
-    for one, english, chinese in with_numbers[:40]:
-        number = re.search(r"\d+\.\d+", chinese.critical_components).group()
-        changed = chinese.critical_components.replace(number, f"{float(number) + 137.77:.2f}")
-        assert check_mirror(english, chinese.model_copy(update={"critical_components": changed}), one) == "number"
-
-
-def test_any_given_decision_is_justified_without_contradiction_or_not_argued(facts):
-    for decision in TOKENS:
+def test_a_decision_given_or_not_is_justified_without_contradiction_or_not_argued(facts):
+    for decision in (None, *TOKENS):
         written = [(one, write_answers(one, np.random.default_rng(3), decision)) for one in facts[::7]]
         given = [(one, *answers) for one, answers in written if answers is not None]
         assert not given or decision != "return_to_home"
         assert len(given) < len(written) or decision != "yaw_left_to_follow"
         for one, english, chinese in given:
-            assert english.flight_decision == chinese.flight_decision == decision
+            assert english.flight_decision == chinese.flight_decision == (decision or english.flight_decision)
             assert contradictions_of(english, one, "en") == contradictions_of(chinese, one, "zh") == []
             assert check_mirror(english, chinese, one) is None
-            assert ACTIONS[decision].zh in chinese.reasoning_trace
+            assert ACTIONS[english.flight_decision].zh in chinese.reasoning_trace

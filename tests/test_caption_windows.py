@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from commands import invoke, obeyed
+from specimens_release import all_bytes
 from teacher_server import TeacherServer
 
 from caption.answer_formats.formats import FORMATS, Draft
@@ -32,7 +33,6 @@ from caption.verification.facts import measure_facts
 from caption.verification.references import look_up, parse_reference
 from cosfly.formats.captions import OWN_PROMPTS, PICTURES_MARK, Coc, Prompt, read_captions
 from cosfly.formats.people import Goal
-from cosfly.formats.playback import Track
 from cosfly.formats.playback_file import read_track, write_track
 from cosfly.formats.segments import Mission
 from cosfly.formats.tracks import find_tracks, read_twin
@@ -94,31 +94,30 @@ def test_changing_all_future_frames_leaves_requests_byte_identical(tree, tmp_pat
     shutil.copytree(tree, spoiled)
     spoil_future(spoiled, current=7)
     for limit, is_same in ((4, True), (5, False)):  # of the window that ends at 8 a frame that is observed was changed
-        before, after = (
-            free_requests(root, tmp_path / f"{root.name}_{limit}", limit, layout) for root in (tree, spoiled)
-        )
+        outs = {root: tmp_path / f"{root.name}_{limit}" for root in (tree, spoiled)}
+        before, after = (free_requests(root, out, limit, layout) for root, out in outs.items())
         assert len(before) == 2 * limit  # English and Chinese
         assert (before == after) is is_same
 
 
-def test_facts_of_a_hand_made_window(tree):
-    window = next(cut_windows(flight_in(tree), WindowConfig())).observed
+def window_of(*columns: np.ndarray) -> ObservedWindow:
+    """A window whose frames have these columns, and no pictures."""
+    place = ("track_ORI_frame_00004", "Town", "track", "ORI", tuple(range(5)), 1280, 720)
+    return ObservedWindow(*place, observed_frames(*columns), (Path("frame"),) * 5, (frozenset[str](),) * 5)
+
+
+def test_facts_of_a_hand_made_window():
     x = np.arange(5.0)
-    window = dataclasses.replace(
-        window,
-        width_px=640,
-        height_px=360,
-        frames=observed_frames(
-            100.0 + 0.5 * x,
-            np.stack([x, 0 * x, 20.0 - 0.5 * x], axis=1),  # 1 m forward, 0.5 m down per 0.5 s
-            np.stack([0 * x - 30.0, np.array([178.0, 179.0, -180.0, -179.0, -178.0]), 0 * x], axis=1),
-            np.stack([x + 15.0, 0 * x, 0 * x + 0.9], axis=1),
-            np.full((5, 2), np.nan),
-            np.tile([340.0, 160.0, 360.0, 220.0], (5, 1)),
-            np.array([True, True, True, True, False]),
-            np.array([True, True, True, False, False]),
-            np.array([np.nan, 1.0, 0.5, 0.1, 0.0]),
-        ),
+    window = window_of(
+        100.0 + 0.5 * x,
+        np.stack([x, 0 * x, 20.0 - 0.5 * x], axis=1),  # 1 m forward, 0.5 m down per 0.5 s
+        np.stack([0 * x - 30.0, np.array([178.0, 179.0, -180.0, -179.0, -178.0]), 0 * x], axis=1),
+        np.stack([x + 15.0, 0 * x, 0 * x + 0.9], axis=1),
+        np.full((5, 2), np.nan),
+        np.tile([660.0, 340.0, 680.0, 400.0], (5, 1)),
+        np.array([True, True, True, True, False]),
+        np.array([True, True, True, False, False]),
+        np.array([np.nan, 1.0, 0.5, 0.1, 0.0]),
     )
     facts = measure_facts(window)
     assert facts.speed_mps == (2.24, 2.24, 2.24, 2.24, 2.24)  # sqrt(1 + 0.25) / 0.5
@@ -164,18 +163,13 @@ def two_tracks(tmp_path_factory):
     return root
 
 
-def flights_of(root) -> tuple[Track, Track]:
-    clean, perturbed = (read_track(folder) for folder in find_tracks(root))
-    return clean, perturbed
-
-
 def labels_of(windows) -> list[str | None]:
     return [TABLE.label_of(measure(window.future)) for window in windows]
 
 
 @pytest.mark.parametrize("label_from", ["twin", "offsets"])
 def test_both_tracks_have_the_same_labels_where_the_same_was_visible(two_tracks, label_from):
-    clean, perturbed = flights_of(two_tracks)
+    clean, perturbed = map(read_track, find_tracks(two_tracks))
     twin = read_twin(perturbed) if label_from == "twin" else None
     expected = list(cut_windows(clean, NO_IMAGES))
     found = list(cut_windows(perturbed, NO_IMAGES, twin=twin))
@@ -226,10 +220,8 @@ def test_no_label_comes_from_an_order_that_nobody_knows_yet(ordered):
 
 def test_a_mission_reaches_no_request_before_its_order_stands(tree, ordered):
     def users(root):
-        asked = [
-            make_question(w.observed, ImageConfig(), "slots", RELATIVE).asked
-            for w in cut_windows(flight_in(root), NO_IMAGES)
-        ]
+        observed = [window.observed for window in cut_windows(flight_in(root), NO_IMAGES)]
+        asked = [make_question(one, ImageConfig(), "slots", RELATIVE).asked for one in observed]
         return [(prompts["en"].user, prompts["zh"].user) for prompts in asked]
 
     plain, told = users(tree), users(ordered)
@@ -243,7 +235,7 @@ def make_window(hidden: tuple[bool, ...] = (False,) * 5, turn_deg: float = 0.0) 
     """A drone that flies along +y at 1 m/s, 19.1 m above the hip of a pedestrian who walks along -x at 2 m/s."""
     x = np.arange(5.0)
     flags = np.array(hidden)
-    frames = observed_frames(
+    return window_of(
         0.5 * x,
         np.stack([0 * x + 100.0, 0.5 * x, 0 * x + 20.0], axis=1),
         np.stack([0 * x - 45.0, 90.0 + turn_deg * x, 0 * x], axis=1),
@@ -254,9 +246,6 @@ def make_window(hidden: tuple[bool, ...] = (False,) * 5, turn_deg: float = 0.0) 
         ~flags,
         np.where(flags, 0.0, 1.0),
     )
-    folders = (Path("frame"),) * 5
-    place = ("track_ORI_frame_00004", "Town", "track", "ORI", tuple(range(5)), 1280, 720)
-    return ObservedWindow(*place, frames, folders, (frozenset[str](),) * 5)
 
 
 def lines_of(window: ObservedWindow, vocabulary=RELATIVE, language="en") -> list[str]:
@@ -400,9 +389,7 @@ def test_captions_are_asked_with_them_and_keep_them(tmp_path):
         assert caption.prompt["zh"].system.endswith(OWN_LINE.replace("$$", "$"))
         [line] = [line for line in caption.prompt["en"].user.splitlines() if line.startswith("HEIGHT ")]
         assert " m 100 % $1, " in line
-    assert {p.name: p.read_bytes() for p in (out / OWN_PROMPTS).iterdir()} == {
-        p.name: p.read_bytes() for p in mine.iterdir()
-    }
+    assert all_bytes(out / OWN_PROMPTS) == all_bytes(mine)
     listed = {entry["path"] for entry in json.loads((out / "manifest.json").read_text())["outputs"]}
     assert {f"{OWN_PROMPTS}/{p.name}" for p in mine.iterdir()} <= listed
     with pytest.raises(ResumeError, match="prompts"):

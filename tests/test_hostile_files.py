@@ -3,10 +3,8 @@ text, pages and cards show it as it is, and no length of it is too long.
 """
 
 import base64
-import copy
 import io
 import json
-import random
 import re
 import struct
 import zlib
@@ -14,7 +12,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any, NamedTuple
+from random import Random
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,37 +65,30 @@ from specimens import make_playback_tree, map_of, pack_depth
 
 INPUTS = 40  # for each reader
 LONGEST_LINE = 5_000
-Random = random.Random
-
-
-class Reader(NamedTuple):
-    """A file below the specimens, as a pattern, and how it is read."""
-
-    file: str
-    read: Callable[[Path], object]
 
 
 FLIGHT = "tree/Town01/*/ORI"
 FRAME = f"{FLIGHT}/frames_playback/frame_00003"
-READERS = {
-    "boxes": Reader("boxes_3d.json", read_boxes),
-    "region": Reader("roi_polygon.json", read_roi),
-    "boxes, GeoJSON": Reader("own.geojson", lambda path: boxfile.load(boxfile.BoxesConfig(path=path))),
-    "table of boxes": Reader("own.csv", lambda path: boxfile.load(boxfile.BoxesConfig(path=path))),
-    "city model": Reader("city.json", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
-    "SimWorld": Reader("world.json", lambda path: simworld.load(simworld.SimWorldConfig(world=path))),
-    "flight": Reader(f"{FLIGHT}/trajectory.json", lambda path: read_track(path.parent)),
-    "annotation": Reader(f"{FRAME}/meta.json", lambda path: read_meta(path.parent)),
-    "picture": Reader(f"{FRAME}/rgb.png", lambda path: read_rgb(path.parent)),
-    "instances": Reader(f"{FRAME}/instance.png", lambda path: read_instance(path.parent)),
-    "depth": Reader(f"{FRAME}/depth.npy", lambda path: read_depth(path.parent)),
-    "depth, packed": Reader(f"{FRAME}/{DEPTH_PNG}".replace("Town01", "Town02"), lambda path: read_depth(path.parent)),
-    "captions": Reader("captions.jsonl", lambda path: list(read_captions(path))),
-    "release record": Reader("release/dataset/release.json", read_record),
-    "shard": Reader("release/dataset/data/*.parquet", lambda path: list(rows_of(path))),
-    "checksums": Reader(f"release/dataset/{CHECKSUMS}", lambda path: read_checksums(path.parent)),
-    "manifest": Reader("release/manifest.json", lambda path: read_manifest(path.parent)),
-    "answer": Reader("answer.txt", lambda path: parse_answer(path.read_text(errors="ignore"))),
+# A file below the specimens, as a pattern, and how it is read.
+READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
+    "boxes": ("boxes_3d.json", read_boxes),
+    "region": ("roi_polygon.json", read_roi),
+    "boxes, GeoJSON": ("own.geojson", lambda path: boxfile.load(boxfile.BoxesConfig(path=path))),
+    "table of boxes": ("own.csv", lambda path: boxfile.load(boxfile.BoxesConfig(path=path))),
+    "city model": ("city.json", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
+    "SimWorld": ("world.json", lambda path: simworld.load(simworld.SimWorldConfig(world=path))),
+    "flight": (f"{FLIGHT}/trajectory.json", lambda path: read_track(path.parent)),
+    "annotation": (f"{FRAME}/meta.json", lambda path: read_meta(path.parent)),
+    "picture": (f"{FRAME}/rgb.png", lambda path: read_rgb(path.parent)),
+    "instances": (f"{FRAME}/instance.png", lambda path: read_instance(path.parent)),
+    "depth": (f"{FRAME}/depth.npy", lambda path: read_depth(path.parent)),
+    "depth, packed": (f"{FRAME}/{DEPTH_PNG}".replace("Town01", "Town02"), lambda path: read_depth(path.parent)),
+    "captions": ("captions.jsonl", lambda path: list(read_captions(path))),
+    "release record": ("release/dataset/release.json", read_record),
+    "shard": ("release/dataset/data/*.parquet", lambda path: list(rows_of(path))),
+    "checksums": (f"release/dataset/{CHECKSUMS}", lambda path: read_checksums(path.parent)),
+    "manifest": ("release/manifest.json", lambda path: read_manifest(path.parent)),
+    "answer": ("answer.txt", lambda path: parse_answer(path.read_text(errors="ignore"))),
 }
 
 
@@ -152,6 +144,14 @@ def _other_bytes(data: bytes, rng: Random) -> bytes:
     ])  # fmt: skip
 
 
+def places_in(value: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield where values stand in JSON: what holds each, and its key there."""
+    for key in value if isinstance(value, dict) else range(len(value)):
+        yield value, key
+        if isinstance(value[key], dict | list):
+            yield from places_in(value[key])
+
+
 def _other_value(data: bytes, rng: Random) -> bytes:
     """Change one value of JSON, or of a line of it; the shape stays."""
     lines = data.split(b"\n") if data.count(b'{"') > 1 and data.startswith(b'{"') else [data]
@@ -160,14 +160,7 @@ def _other_value(data: bytes, rng: Random) -> bytes:
         box = [json.loads(lines[k])]
     except ValueError:
         return _other_bytes(data, rng)
-    places: list[tuple[Any, Any]] = []
-    waiting: list[Any] = [box]
-    while waiting:
-        group = waiting.pop()
-        for key in group if isinstance(group, dict) else range(len(group)):
-            places.append((group, key))
-            if isinstance(group[key], dict | list):
-                waiting.append(group[key])
+    places = list(places_in(box))
     group, key = min(rng.sample(places, min(3, len(places))), key=lambda place: len(str(place[1])))
     if isinstance(group, dict) and rng.random() < 0.2:
         del group[key]
@@ -186,16 +179,16 @@ def _other_size(data: bytes, rng: Random) -> bytes:
 @pytest.mark.parametrize("name", READERS)
 @pytest.mark.timeout(300)
 def test_a_reader_takes_any_bytes_or_refuses_them_in_one_line(specimens, name):
-    reader = READERS[name]
-    path = min(specimens.glob(reader.file))
+    file, read = READERS[name]
+    path = min(specimens.glob(file))
     honest = path.read_bytes()
-    reader.read(path)
+    read(path)
     lines: list[str] = []
     try:
         for number in range(INPUTS):
-            path.write_bytes(_changed(reader.file, honest, Random(f"{name}/{number}")))
+            path.write_bytes(_changed(file, honest, Random(f"{name}/{number}")))
             try:
-                reader.read(path)
+                read(path)
             except CosflyError as error:
                 lines.append(str(error))
     finally:
@@ -227,9 +220,7 @@ def test_lines_and_cells_are_printed_and_not_obeyed(monkeypatch):
     shared.console.print(HOSTILE)
     shared.console.print(table)
     lines = stream.getvalue()
-    assert "\x1b]0" not in lines
-    assert "\x07" not in lines
-    assert "\u202e" not in lines
+    assert not OBEYED.search(lines)
     assert lines.count("\\x1b]0;owned\\x07") == 4
     assert lines.count("[/]") == 4  # and no MarkupError
 
@@ -280,36 +271,18 @@ class Tags(HTMLParser):
     handle_startendtag = handle_starttag
 
 
-def texts_in(value: Any, path: tuple = ()) -> Iterator[tuple]:
-    """Yield where texts stand in JSON."""
-    if isinstance(value, str):
-        yield path
-    elif isinstance(value, dict | list):
-        for key in value if isinstance(value, dict) else range(len(value)):
-            yield from texts_in(value[key], (*path, key))
-
-
 def forged(model: type[BaseModel], honest: BaseModel, least: int) -> BaseModel:
     value = honest.model_dump(mode="json")
     count = 0
-    for path in list(texts_in(value)):
-        other = copy.deepcopy(value)
-        place = other
-        for key in path[:-1]:
-            place = place[key]
-        place[path[-1]] = HOSTILE
+    for group, key in [place for place in places_in(value) if isinstance(place[0][place[1]], str)]:
+        text, group[key] = group[key], HOSTILE
         try:
-            model.model_validate(other)
+            model.model_validate(value)
+            count += 1
         except ValidationError:
-            continue  # one of a closed set
-        value, count = other, count + 1
+            group[key] = text  # one of a closed set
     assert count >= least
     return model.model_validate(value)
-
-
-@pytest.fixture(scope="module")
-def inspection(tree, tmp_path_factory) -> Path:
-    return inspect(InspectConfig(jerk_rms_max_mps3=1e6), None, None, tree, tmp_path_factory.mktemp("inspected"))
 
 
 def check_page(page: str, honest: str) -> None:
@@ -324,7 +297,8 @@ def check_page(page: str, honest: str) -> None:
     assert "&lt;script&gt;" in page  # shown, not left out
 
 
-def test_the_page_of_an_inspection_shows_forged_records(inspection):
+def test_the_page_of_an_inspection_shows_forged_records(tree, tmp_path):
+    inspection = inspect(InspectConfig(jerk_rms_max_mps3=1e6), None, None, tree, tmp_path / "inspected")
     honest = read_inspection(inspection)
     false = forged(Inspection, honest, 8)
     check_page(report_html(HOSTILE, false, {}), (inspection.parent / "report.html").read_text(encoding="utf-8"))
@@ -338,12 +312,9 @@ def test_the_page_of_a_captioning_run_shows_forged_captions(tree, tmp_path):
     check_page(page, (done / "report.html").read_text(encoding="utf-8") + '<div class="gone"></div>')
 
 
-markdown = MarkdownIt("commonmark", {"html": True}).enable("table")
-
-
 def test_a_card_shows_forged_texts(specimens):
     card = render_card(forged(ReleaseRecord, read_record(specimens / "release/dataset/release.json"), 8))
-    page = markdown.render(card.split("\n---\n", 1)[1])
+    page = MarkdownIt("commonmark", {"html": True}).enable("table").render(card.split("\n---\n", 1)[1])
     assert "alert(1)" in page
     assert not {"script", "img", "a"} & {tag for tag, *_ in Tags(page).seen}
     assert not OBEYED.search(card.replace("\n", ""))

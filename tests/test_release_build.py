@@ -1,10 +1,10 @@
 """Building and packaging a release: what is in the folder, that others' tools open it, what verify finds wrong."""
 
-import io
 import json
 import os
 import re
 import shutil
+from collections import Counter
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from PIL import Image
 from release_tampering import errors_in, forge
 from specimens_foreign import write_foreign_tree
 from specimens_release import (
@@ -33,7 +32,7 @@ from caption.schema import CaptionConfig
 from caption.stage import stage as caption_stage
 from cosfly.formats.boxes import MapHeader
 from cosfly.formats.captions import write_captions
-from cosfly.formats.frames import read_depth, read_instance
+from cosfly.formats.frames import read_rgb
 from cosfly.formats.inspection import write_inspection
 from cosfly.formats.playback_file import read_track
 from cosfly.formats.town import write_town_map
@@ -42,7 +41,6 @@ from cosfly.geometry.trajectory_metrics import derivative_rms, length_m
 from cosfly.runtime.errors import ConfigError, InputError, NothingKept, VerifyError
 from cosfly.runtime.io import sha256_file, write_checksums
 from cosfly.runtime.json_io import read_json
-from cosfly.runtime.png import colours_of
 from release.build.config import ReleaseConfig
 from release.build.shards import points_part
 from release.build.sources import Source
@@ -190,25 +188,16 @@ def cut(path: Path, num_bytes: int) -> None:
 def other_size(root: Path) -> None:
     """One trajectory of a tree of another size in the place of the first."""
     other = make_playback_tree(root / "other", 1, POINTS, width_px=64, height_px=36)
-    for variant in ("ORI", "aug_001"):
-        target = first_flight(root).parent / variant
-        shutil.rmtree(target)
-        shutil.copytree(next(other.glob(f"*/*/{variant}")), target)
-
-
-def other_kind(frame_file: str, kind: str):
-    def change(root: Path) -> None:
-        path = first_flight(root) / "frames_playback/frame_00005" / frame_file
-        picture = Image.fromarray(colours_of(path.read_bytes(), path))
-        if kind == "16 bits":
-            path.write_bytes(cv2.imencode(".png", np.asarray(picture, np.uint16) * 257)[1].tobytes())
-        else:
-            picture.convert("L").save(path)
-
-    return change
+    target = first_flight(root).parent
+    shutil.rmtree(target)
+    shutil.copytree(next(other.glob("*/*")), target)
 
 
 FIFTH = "frames_playback/frame_00005"
+
+
+def painted(frame_file: str, *shape: int, dtype=np.uint8):
+    return lambda root: cv2.imwrite(str(first_flight(root) / FIFTH / frame_file), np.zeros(shape, dtype))
 
 
 def caption(**values):
@@ -230,8 +219,8 @@ def not_finite(root: Path) -> None:
 DAMAGES = {
     "depth cut by 100 bytes": (lambda r: cut(first_flight(r) / FIFTH / "depth.npy", 100), "depth.npy"),
     "a picture cut short": (lambda r: cut(first_flight(r) / FIFTH / "rgb.png", 20), "rgb.png"),
-    "a picture of 16 bits": (other_kind("rgb.png", "16 bits"), "16 bits, colour type 2"),
-    "a mask of grey": (other_kind("instance.png", "grey"), "1 channels, not RGB"),
+    "a picture of 16 bits": (painted("rgb.png", 27, 48, 3, dtype=np.uint16), "16 bits, colour type 2"),
+    "a mask of grey": (painted("instance.png", 27, 48), "1 channels, not RGB"),
     "a picture that is missing": (lambda r: (first_flight(r) / FIFTH / "instance.png").unlink(), "missing or empty"),
     "1e999 in a trajectory": (not_finite, "is not finite"),
     "pictures of two sizes": (other_size, "the tracks differ in the size of pictures"),
@@ -327,32 +316,18 @@ def loaded(built, tmp_path_factory):
 def test_load_dataset_gives_pictures_poses_and_both_languages(loaded, release_inputs):
     assert (len(loaded), set(loaded["town"])) == (4 * 8, {"Town01", "Town02"})
     for row in (loaded[0], loaded[9], loaded[31]):
-        folder = release_inputs / "tree" / row["town"] / row["trajectory"] / row["variant"]
-        flight, i = read_track(folder), row["frame_index"]
-        frame = flight.frame_folder(i)
-        coded = np.asarray(row["instance"]).astype(np.uint16)
-        kinds, ids = read_instance(frame)
-        assert (coded[..., 0] == kinds).all()
-        assert ((coded[..., 1] | coded[..., 2] << 8) == ids).all()
-        depth = np.load(io.BytesIO(row["depth"]))
-        assert depth.dtype == np.float32
-        assert depth.tobytes() == read_depth(frame).tobytes()
-        assert row["is_perturbed"] == flight.perturbation.is_perturbed[i]
-        assert row["perturbation"] == flight.events(i)
+        flight = read_track(release_inputs / "tree" / row["town"] / row["trajectory"] / row["variant"])
+        assert (np.asarray(row["image"]) == read_rgb(flight.frame_folder(row["frame_index"]))).all()
+        assert row["perturbation"] == flight.events(row["frame_index"])
         assert row["track"] == ("clean" if row["variant"] == "ORI" else "perturbed")
-    captioned = loaded.filter(lambda row: row["has_caption"])
-    row = captioned[0]
+    row = loaded.filter(lambda row: row["has_caption"])[0]
     assert "行人" in row["caption_zh_reasoning_trace"]
     assert row["caption_en_critical_components"].endswith(f"about {10 + row['frame_index']} m ahead.")
     assert row["caption_window"] == list(range(row["frame_index"] - 4, row["frame_index"] + 1))
     assert row["decision"] == row["caption_en_flight_decision"] == row["caption_zh_flight_decision"]
-    assert row["teacher_kind"] == "rules"
-    for row in captioned:
-        assert (row["writing"], row["caption_picture_px"]) == ("slots", [96, 54])
-        assert row["values_filled_zh"] is None
-    bare = loaded.filter(lambda row: not row["has_caption"])
-    assert bare[0]["caption_en_reasoning_trace"] is None
-    assert bare[0]["caption_window"] is bare[0]["caption_picture_px"] is bare[0]["target_mask_bbox"] is None
+    assert (row["teacher_kind"], row["writing"], row["caption_picture_px"]) == ("rules", "slots", [96, 54])
+    bare = loaded.filter(lambda row: not row["has_caption"])[0]
+    assert bare["caption_en_reasoning_trace"] is bare["caption_window"] is bare["target_mask_bbox"] is None
 
 
 def test_numbers_against_a_slow_oracle(loaded, built, release_inputs):
@@ -367,9 +342,7 @@ def test_numbers_against_a_slow_oracle(loaded, built, release_inputs):
     assert numbers["flights"] == len({(r["town"], r["trajectory"], r["variant"]) for r in rows}) == 4
     assert numbers["trajectories"] == len({(r["town"], r["trajectory"]) for r in rows})
     assert numbers["counts"]["flags"]["has_caption"] == len(with_caption)
-    for decision, count in numbers["counts"]["decision"].items():
-        assert count == sum(row["decision"] == decision for row in with_caption)
-    assert sum(numbers["counts"]["decision"].values()) == len(with_caption)
+    assert numbers["counts"]["decision"] == Counter(row["decision"] for row in with_caption)
     heights = np.array([row["pose"]["z_m"] - row["target"]["z_m"] for row in rows])
     assert numbers["spreads"]["height_m"]["mean"] == pytest.approx(heights.mean(), abs=1e-4)
     assert numbers["spreads"]["height_m"]["std"] == pytest.approx(heights.std(), abs=1e-4)
@@ -416,9 +389,8 @@ def test_a_release_takes_the_licence_of_its_maps_unless_told_and_names_them(rele
 )  # fmt: skip
 def test_a_release_without_a_licence_is_refused(release_inputs, tmp_path, licences, got):
     source = with_maps(release_inputs, tmp_path / "in", **licences)
-    with pytest.raises(ConfigError, match=r"release\.licence") as caught:
+    with pytest.raises(ConfigError, match=rf"{re.escape(got)}.*release\.licence"):
         build(source, tmp_path / "r", UNLICENSED)
-    assert got in str(caught.value)
     assert not (tmp_path / "r" / "dataset").exists()
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from processes import full_disk
+from release_tampering import errors_in
 from specimens_release import CFG, DROPPED, build, release_of
 
 from cosfly.formats.captions import Caption, Coc, read_captions
@@ -65,17 +66,15 @@ def lines_of(path: Path) -> list[dict]:
 def test_messages_are_what_their_loaders_ask_for(run, tmp_path, shown):
     datasets = pytest.importorskip("datasets")
     product = exported(run, tmp_path / "out", frames=shown)
-    samples = lines_of(product / "train.jsonl")
-    found = datasets.load_dataset(
-        "json", data_files=str(product / "train.jsonl"), split="train", cache_dir=str(tmp_path / "cache")
-    )
+    train = product / "train.jsonl"
+    samples = lines_of(train)
+    found = datasets.load_dataset("json", data_files=str(train), split="train", cache_dir=str(tmp_path / "cache"))
     assert len(found) == len(samples) == 2 * len(accepted(run))
     for sample, loaded in zip(samples, found, strict=True):
         assert [turn["role"] for turn in loaded["messages"]] == ["user", "assistant"]
         blocks = sample["messages"][0]["content"]
-        assert (
-            sum(block["type"] == "image" for block in blocks) == len(sample["images"]) == (5 if shown == "all" else 1)
-        )
+        num_pictures = sum(block["type"] == "image" for block in blocks)
+        assert num_pictures == len(sample["images"]) == (5 if shown == "all" else 1)
         assert set(json.loads(sample["messages"][1]["content"][0]["text"])) == set(ANSWER)
         for name in sample["images"]:
             _, *place, frame = Path(name).with_suffix("").parts
@@ -121,9 +120,10 @@ def test_a_training_set_is_not_made_of_a_release(run):
 
 
 @pytest.mark.parametrize("format", ["chat", "sharegpt"])
-def test_a_release_without_captions_is_refused(tmp_path, format):
+def test_a_release_without_captions_verifies_and_is_no_conversation(tmp_path, format):
     make_playback_tree(tmp_path / "tree", 1, 4, width_px=96, height_px=54)  # too short for a window
     dataset = release_of(tmp_path)
+    assert errors_in(dataset, "rows") == {}
     with pytest.raises(CosflyError, match="no caption to export"):
         exported(dataset, tmp_path / "out", format)
     assert not (tmp_path / "out" / format).exists()

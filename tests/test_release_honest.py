@@ -18,25 +18,21 @@ import numpy as np
 import pytest
 from commands import working_here
 from conftest import SHARED_DATA
-from release_lies import Lie, Row, box_moved, captioned, ids_of_things_exchanged
-from release_tampering import depth_of, errors_in, forge, set_depth
+from release_lies import LIES, Row, box_moved, captioned, change, everything, ids_of_things_exchanged, with_depth
+from release_tampering import errors_in, forge
 from simulator_serving import serving
 from teacher_server import TeacherServer
 
 from caption.stage.released import read_released
-from cosfly.formats.captions import write_captions
 from cosfly.maps import synthetic
 from cosfly.pipeline import run as pipeline
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
-from release.build import stage as package
-from release.build.sources import Source
 from release.verify.verify import verify
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
-SKY_M = 999.0
 SHARED_STAGES = ("maps", "simplify", "pedestrians", "plan")
 SHORT = [
     "pedestrians.num_paths=2", "pedestrians.min_distance_m=14", "pedestrians.max_distance_m=22",
@@ -113,7 +109,6 @@ KINDS = {
     "town few frames": ("town", ["release.num_frames=12"]),
     "town slots of a teacher": ("town", [TEACHER, "caption.writing=slots"]),
     "town prose": ("town", [TEACHER, "caption.writing=prose"]),
-    "town without captions": ("town", []),
     "uneven town": ("uneven", []),
     "river narrow": ("river", NARROW),
     "towers haze": ("towers", weather("smog", "morning")),
@@ -156,14 +151,8 @@ def made(tmp_path_factory) -> Iterator[Callable[[str], Path]]:
             work(pipeline.stages(settings(map_name, []), shared)[: len(SHARED_STAGES)])
         for name in SHARED_STAGES:
             shutil.copytree(shared / name, out / name, copy_function=os.link)
-        cfg = settings(map_name, told)
-        if not kind.endswith("without captions"):
-            work(pipeline.stages(cfg, out))
-            return out / "release/dataset"
-        work(pipeline.stages(cfg, out)[:-2])
-        write_captions(out / "none.jsonl", [])
-        source = Source.of_files(out / "render", out / "none.jsonl", out / "inspect/inspect.json")
-        return package.run(cfg.release, [source], out / "release")
+        work(pipeline.stages(settings(map_name, told), out))
+        return out / "release/dataset"
 
     with (
         TeacherServer() as teacher,
@@ -180,16 +169,6 @@ def test_an_honest_release_verifies(made, kind):
     assert report.is_ok, str(report)
 
 
-def depth_of_all(factor: float, offset_m: float) -> Lie:
-    def change(rows: list[Row]) -> None:
-        for row in rows:
-            depth = depth_of(row)
-            depth[depth < SKY_M] = depth[depth < SKY_M] * np.float32(factor) + np.float32(offset_m)
-            set_depth(row, depth)
-
-    return change
-
-
 def labels_mirrored(rows: list[Row]) -> None:
     """Left for right in decisions, labels and texts of every caption, so that all of a row agrees."""
     for row in captioned(rows):
@@ -198,8 +177,8 @@ def labels_mirrored(rows: list[Row]) -> None:
 
 
 SEALED = {
-    "depth 2 % farther": depth_of_all(1.02, 0.0), "depth 0.3 m farther": depth_of_all(1.0, 0.3),
-    "a box moved": box_moved,
+    "depth 2 % farther": change(everything, with_depth(lambda depth, _: depth * 1.02)),
+    "depth 0.3 m farther": LIES["depth_set_off"][0], "a box moved": box_moved,
     "ids exchanged": ids_of_things_exchanged, "labels mirrored": labels_mirrored,
 }  # fmt: skip
 

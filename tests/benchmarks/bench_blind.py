@@ -2,7 +2,6 @@
 rendering.
 
     python tests/benchmarks/bench_blind.py                       six towns of `diverse` to fit on, two to be asked about
-    python tests/benchmarks/bench_blind.py --seeds 0 1 2 3       the same with four times the trajectories
     python tests/benchmarks/bench_blind.py --delft FILE --simworld FILE    and cities by other makers
 
 Shares are in percent. The target counts as visible where a ray of five reaches it and the picture shows its place.
@@ -47,27 +46,21 @@ def windows_of(cfg: RunConfig, names: list[str]) -> tuple[np.ndarray, np.ndarray
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--delft", help="a CityJSON file")
     parser.add_argument("--simworld", help="a SimWorld world, its tables beside it")
     asked = parser.parse_args()
     told = {"delft": f"{{source: cityjson, cityjson: {{path: {asked.delft}}}}}"} if asked.delft else {}
     told |= {"simworld": f"{{source: simworld, simworld: {{world: {asked.simworld}}}}}"} if asked.simworld else {}
     cities = [f"towns.{name}={{maps: {maps}}}" for name, maps in told.items()]
-    cfgs = [load(RunConfig, shipped("diverse.yaml"), [f"seed={seed}", *cities]) for seed in asked.seeds]
-
-    def all_of(*names: str) -> tuple[np.ndarray, np.ndarray]:
-        pasts, labels = zip(*(windows_of(cfg, list(names)) for cfg in cfgs), strict=True)
-        return np.concatenate(pasts), np.concatenate(labels)
-
-    pasts, labels = all_of(*(name for name in cfgs[0].towns if name not in (*told, *UNSEEN)))
+    cfg = load(RunConfig, shipped("diverse.yaml"), cities)
+    pasts, labels = windows_of(cfg, [name for name in cfg.towns if name not in (*told, *UNSEEN)])
     some = rng_for(0, "bench.blind", "some").permutation(len(labels))[:FITTED_ON]
     pasts, labels = pasts[some], labels[some]
     rules = [fit_deciders(pasts, labels, rng_for(0, "bench.blind", str(draw))) for draw in range(3)]
     print(f"fitted on {len(labels):,} windows, {pasts.shape[1]} numbers each")
     print("| town | windows | most frequent | rule | network (three draws) |\n|---|---|---|---|---|")
     for names in (UNSEEN, *((name,) for name in told)):
-        own, wanted = all_of(*names)
+        own, wanted = windows_of(cfg, list(names))
         answers = [np.full(len(wanted), np.bincount(labels).argmax()), rules[0]["rule"](own)]
         shares = [f"{100 * (one == wanted).mean():.1f}" for one in (*answers, *(rule["blind"](own) for rule in rules))]
         print(f"| {' and '.join(names)} | {len(wanted):,} | {shares[0]} | {shares[1]} | {', '.join(shares[2:])} |")

@@ -15,6 +15,7 @@ length. Pictures are noise in memory: reading them is not measured. The first st
 import argparse
 import json
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -55,12 +56,7 @@ PICTURES = 5
 IMAGE, END, PAD, FIRST_WORD = 3, 1, 0, 10  # token numbers of the made-up vocabulary
 WARM_UP = 3
 ANSWER_TOKENS = 512  # whose logits exist at a time
-
-
-class Words:
-    """Stands where a tokenizer stands; texts are numbers from the start."""
-
-    pad_token_id = PAD
+NUMBERS = SimpleNamespace(pad_token_id=PAD)  # stands where a tokenizer stands; texts are numbers from the start
 
 
 class MadeUp(Student):
@@ -93,7 +89,7 @@ def make_student(shape: str, device: str, dtype: Any, seed: int = 0) -> Student:
     torch.manual_seed(seed)
     with torch.device(device):
         model = Qwen3_5ForConditionalGeneration(config).to(dtype)
-    return MadeUp(Words(), "made up", model=model, device=device, dtype=dtype)
+    return MadeUp(NUMBERS, "made up", model=model, device=device, dtype=dtype)
 
 
 def make_text_student(shape: str, device: str, dtype: Any, seed: int) -> Student:
@@ -103,7 +99,7 @@ def make_text_student(shape: str, device: str, dtype: Any, seed: int) -> Student
     torch.manual_seed(seed)
     with torch.device(device):
         model = LlamaForCausalLM(LlamaConfig(**SHAPES[shape], **ends, tie_word_embeddings=True)).to(dtype)
-    return MadeUp(Words(), None, model=model, device=device, dtype=dtype)
+    return MadeUp(NUMBERS, None, model=model, device=device, dtype=dtype)
 
 
 def make_rows(shape: str, count: int, seed: int) -> list[tuple[EncodedSample, list[FramePicture]]]:

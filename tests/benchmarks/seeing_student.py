@@ -172,28 +172,26 @@ def main() -> None:
     parser.add_argument("--language", type=Path, required=True, help="GGUF file of SmolLM2")
     parser.add_argument("--without", nargs="*", default=[], help="towns that are only tested")
     parser.add_argument("--epochs", type=int, default=20)
-    parser.add_argument("--workers", type=int, default=8)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     device = "cuda" if torch.cuda.is_available() else "cpu"
     folders = [folder for tree in arguments.trees for folder in find_tracks(tree)]
-    with ProcessPoolExecutor(arguments.workers) as pool:
+    with ProcessPoolExecutor() as pool:
         read = list(pool.map(frames_of, folders))
-    is_tested = [any(name in str(folder.parent) for name in arguments.without) for folder in folders]
-    parts = {}
-    for kind in (False, True):
-        own = [pair for pair, tested in zip(read, is_tested, strict=True) if tested is kind and len(pair[0])]
-        parts[kind] = [np.concatenate(arrays) for arrays in zip(*own, strict=True)] if own else None
-    print(f"{len(parts[False][0])} frames", flush=True)
+    tracks: dict[str, list] = {"trained": [], "other towns": []}
+    for folder, pair in zip(folders, read, strict=True):
+        is_tested = any(name in str(folder.parent) for name in arguments.without)
+        tracks["other towns" if is_tested else "trained"] += [pair] if len(pair[0]) else []
+    parts = {name: [np.concatenate(arrays) for arrays in zip(*own, strict=True)] for name, own in tracks.items() if own}
+    print(f"{len(parts['trained'][0])} frames", flush=True)
     torch.manual_seed(0)
     tower = SmolVLMForConditionalGeneration(
         SmolVLMConfig(text_config={"model_type": "llama", "num_hidden_layers": 1, "hidden_size": 64, "vocab_size": 8,
             "num_attention_heads": 1, "num_key_value_heads": 1, "intermediate_size": 64, "pad_token_id": 0},
             vision_config=VISION, image_token_id=1, pad_token_id=0)
     ).float().model.vision_model  # fmt: skip
-    finder = train_tower(tower, *parts[False], arguments.epochs, device)
-    shares = {name: found_share(finder, *part, device) for name, part in (
-        ("trained", parts[False]), ("other towns", parts[True])) if part is not None}  # fmt: skip
+    finder = train_tower(tower, *parts["trained"], arguments.epochs, device)
+    shares = {name: found_share(finder, *part, device) for name, part in parts.items()}
     assemble(arguments.language, arguments.out, finder.tower.cpu())
     print(json.dumps({"target_found": {name: round(share, 3) for name, share in shares.items()}}))
 
