@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from shapely import LineString, MultiLineString, Polygon, affinity, union_all
+from shapely import LineString, MultiLineString, Point, Polygon, affinity, union_all
 
 from cosfly.formats.boxes import BoxMap, write_boxes
 from cosfly.formats.kinds import KIND_NAMES, KINDS
@@ -284,6 +284,45 @@ def test_pavements_leave_carriageways_and_mapped_pavements_free(tmp_path):
             edge = line.offset_curve(side)
             free = edge.difference(roads.buffer(0.6)).difference(footway.buffer(0.6))
             assert free.difference(derived).length < 0.01 * edge.length
+
+
+def test_crossings_have_stripes_and_footways_end_at_the_kerb(tmp_path):
+    """A street of 7 m along x, with a crossing as a way and as a node, and footways that cross it or end in it."""
+    features = [
+        feature("LineString", [[0, 0], [90, 0]], highway="residential", sidewalk="no"),
+        feature("LineString", [[20, -8], [20, 8]], highway="footway", footway="crossing"),
+        feature("Point", [60, 0], highway="crossing", crossing="zebra"),
+        feature("Point", [20, 0], highway="crossing"),  # of the way
+        feature("LineString", [[40, 0], [40, 20]], highway="footway"),
+        feature("LineString", [[45, -20], [45, 20]], highway="footway", bridge="yes"),
+    ]
+    made = loaded(tmp_path, collection(*features), ".geojson", type_column="highway", units="m")
+    paint = made.select(made.kinds == KINDS["RoadLines"])
+    assert_allclose(np.unique(np.round(paint.centers[:, 0], 3)), [20.0, 60.0])
+    assert_allclose(np.sort(paint.centers[paint.centers[:, 0] > 50, 1]), np.arange(-3.0, 3.5))
+    assert_allclose(np.sort(2 * paint.half_extents[:, :2]), [[0.5, 3.0]] * len(paint))
+    paths = footprints(made.select(made.kinds == KINDS["Sidewalks"]))
+    bridge = [path for path in paths if path.distance(Point(45, 0)) < 0.1]
+    assert len(bridge) == 1
+    assert all(path.distance(LineString([[0, 0], [90, 0]])) > 2.9 for path in paths if path not in bridge)
+    assert made.header.dropped_objects == {"unmapped_type": 1}
+
+
+def test_tags_of_openstreetmap_mean_what_they_say(tmp_path, caplog):
+    yard = square(0, 0, 20)
+    features = [
+        feature("LineString", [[0, 50], [40, 50]], natural="tree_row"),
+        feature("Polygon", yard, landuse="residential", barrier="wall"),
+        feature("Polygon", square(60, 0), building="yes", height="ca. 9"),
+        feature("Polygon", square(90, 0), building="yes", layer="-1"),
+        feature("Polygon", square(120, 0), building="yes", location="underground"),
+        feature("Polygon", square(150, 0), building="roof"),
+    ]
+    columns = {"type_column": "building,natural,landuse,barrier", "units": "m", "types": {"roof": "NONE"}}
+    made = loaded(tmp_path, collection(*features), ".geojson", **columns)
+    assert made.counts() == {"Vegetation": 6, "Walls": 4, "Buildings": 1}
+    assert made.header.dropped_objects == {"underground": 2, "unmapped_type": 1}
+    assert "height_m='ca. 9': the value is not a number, so a default is used" in caplog.text
 
 
 def test_water_is_open_below_bridges(tmp_path):

@@ -52,6 +52,16 @@ def test_people_walk_where_the_settings_say(ground, columns):
     assert not found.parts[:, columns:].any()
 
 
+def test_the_cells_at_the_edge_of_a_turned_road_are_road():
+    boxes = BoxList()
+    boxes.add("Roads", (60, 60), (120, 7), -0.3, 0.0, 27.0)
+    boxes.add("Sidewalks", (60, 90), (120, 2), -0.3, 0.0, 27.0)
+    ground = walkable_ground(boxes.box_map(), PedestriansConfig(road_cost=20, min_component_cells=100))
+    rows, columns = np.nonzero(ground.may_end)
+    y, x = (ground.grid.centers_of(np.column_stack([columns, rows])) - [60, 90])[:, ::-1].T
+    assert np.abs(y * np.cos(np.radians(27)) - x * np.sin(np.radians(27))).max() < 1.5  # on the pavement
+
+
 def test_walkable_ground_in_small_areas_is_left_out_and_counted(tmp_path, caplog):
     caplog.set_level("INFO")
     # Pavement of 100 m by 100 m, and 50 m away a square of 20 m and one of 10 m.

@@ -127,15 +127,18 @@ def surface(box_map: BoxMap, kinds: Collection[int] = GROUND_KINDS, *, like: Occ
 
 
 def surface_kinds(box_map: BoxMap, kinds: Collection[int], *, like: OccupancyGrid) -> np.ndarray:
-    """Return the kind of the topmost ground in the middle of each cell, (ny, nx) uint8; 0 where there is none.
+    """Return the kind of the topmost ground of each cell, (ny, nx) uint8; 0 where there is none.
+
+    The ground in the middle of a cell counts, and at the edge of all ground that in any part of the cell.
 
     kinds: as for `surface`; of kinds in one plane, to a centimetre, the higher layer counts.
     """
     boxes = _surfaces(box_map, kinds)
     boxes = boxes.select(upward_order(boxes))
-    cell_kinds = np.zeros(like.occupied.shape, dtype=np.uint8)
-    _mark(boxes, like, cell_kinds, boxes.kinds, touch=0.5 - TOUCH_M)
-    return cell_kinds
+    in_middle, in_any_part = np.zeros((2, *like.occupied.shape), dtype=np.uint8)
+    _mark(boxes, like, in_middle, boxes.kinds, touch=0.5 - TOUCH_M)
+    _mark(boxes, like, in_any_part, boxes.kinds)
+    return np.where(in_middle, in_middle, in_any_part)
 
 
 def upward_order(box_map: BoxMap) -> np.ndarray:

@@ -11,7 +11,7 @@ import io
 import logging
 import math
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -41,6 +41,7 @@ from cosfly.maps.footprints import (
     polygons_of,
     with_derived_ground,
 )
+from cosfly.maps.street_features import PAVEMENT_CREDITS, Feature, completed, is_underground
 from cosfly.maps.units import METRES, Units, declared_units, length_m, seen_units, to_metres
 from cosfly.runtime.config import Config, read_yaml
 from cosfly.runtime.errors import ConfigError, InputError, nearest
@@ -60,19 +61,16 @@ COLUMNS = ("type", "id", "name", *NUMBERS, *DECLARED)
 SIZES = ("length_m", "width_m", "height_m", "min_height")  # numbers in metres, or texts with a unit
 OTHERS = ("z_m", "yaw_deg", "building:levels", "building:min_level", "lanes")
 PLACE = ("x_m", "y_m", "length_m", "width_m")  # every table has them; and height_m, except of surfaces
-TYPES = [kind for kind in KINDS if kind != "NONE"]
+NOTHING = "NONE"
+TYPES = [kind for kind in KINDS if kind != NOTHING]
 GEOMETRIES = ("Point", "LineString", "Polygon", "MultiPoint", "MultiLineString", "MultiPolygon")  # of GeoJSON
 NOT_MAPPED = ("unmapped_type", "underground")  # reasons to skip a valid feature
-WITHOUT_PAVEMENT = ("no", "none", "separate")  # values of `sidewalk`; separate: mapped as a way of its own
 LARGEST_PLACE = 1e8  # absolute value of a coordinate of GeoJSON, in any unit
 MOST_NAME = 40  # characters of a name in messages
 HSTORE_TAG = re.compile(r'"([^"\\]+)"=>"([^"\\]*)"')
 LINE_M = 0.1  # farthest that a corner of a line may be moved
-PAVEMENT_CREDITS = "Pavements are derived by cosfly from the streets, not mapped."
 SLAB_M = 0.3  # thickness of a surface without a height: its top is the ground
 STOREY_M, LANE_M = 3.0, 3.5
-BRIDGE_EDGE_M = 0.5  # at each side: the default of pedestrians.safety_radius_m
-BRIDGE_NEAR_M = 15.0  # water so near to a bridge is covered apart: a long rectangle would reach into the opening
 # Width of a line, sides of a point, and height of a thing where `type_column` names the types and nothing is declared.
 DEFAULT_SIZES_M = {
     "Buildings": (10.0, 6.0), "Roads": (7.0, SLAB_M), "Sidewalks": (2.0, SLAB_M), "RailTrack": (3.0, SLAB_M),
@@ -107,6 +105,7 @@ TYPE_RULES = [
     for column in line["column"].split("|") for values, kind in line["kinds"].items() for value in values.split("|")
 ]  # fmt: skip
 STREETS_WITH_PAVEMENTS = FEATURES["streets_with_pavements"].split("|")
+WIDTHS_M: dict[str, float] = FEATURES["widths_m"]
 
 
 class BoxesConfig(Config):
@@ -126,7 +125,7 @@ class BoxesConfig(Config):
         "values become types by a list, other columns are ignored and sizes have defaults; class for Overture",
     )
     types: dict[str, str] = Field(
-        {}, description="type names of the file and their types in cosfly, such as {house: Buildings}"
+        {}, description="type names of the file and their types in cosfly, such as {house: Buildings}; NONE drops them"
     )
     most_skipped: float = Field(
         0.2, ge=0, le=1, description="largest share of rows or features that may be skipped because they are invalid"
@@ -143,7 +142,9 @@ class BoxesConfig(Config):
     @field_validator("types")
     @classmethod
     def _types_are_known(cls, types: dict[str, str]) -> dict[str, str]:
-        problems = [f"{name} has the unknown type {kind!r}" for name, kind in types.items() if kind not in TYPES]
+        problems = [
+            f"{name} has the unknown type {kind!r}" for name, kind in types.items() if kind not in (*TYPES, NOTHING)
+        ]
         if problems:
             raise ValueError(f"{'; '.join(problems)}; expected one of {', '.join(TYPES)}")
         return types
@@ -186,6 +187,7 @@ class _BoxesOfRows:
     size_sources: Counter[str] = field(default_factory=Counter)  # number of boxes by the source of their sizes
     dropped: SkippedEntries = field(default_factory=SkippedEntries)  # rows without boxes
     repairs: list[str] = field(default_factory=list)  # places of outlines that were repaired
+    unread: list[str] = field(default_factory=list)  # properties that are not numbers
 
 
 class _Size(NamedTuple):
@@ -195,6 +197,7 @@ class _Size(NamedTuple):
     low_m: float
     high_m: float
     source: str  # file, levels or default
+    unread: Sequence[str] = ()  # properties that are not numbers, in whose place a default is used
 
 
 def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
@@ -242,18 +245,14 @@ def _read_rows(cfg: BoxesConfig, path: Path, *, is_table: bool) -> BoxMap:
     rows = _in_metres(rows, units, path, is_table=is_table)
     num_objects = len(rows)
     if not cfg.is_plain:
-        if cfg.derive_pavements:
-            rows = [*rows, *_pavements_of(rows, cfg)]
-        rows = _opened_below_bridges(rows, cfg)
+        rows = _completed(rows, cfg)
     made = _make_boxes(rows, cfg)
     ids = _ids_of(rows) if cfg.is_plain else []
     _check_and_report(made, rows, ids, cfg, path)
     header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=num_objects)
     changes: dict[str, Any] = {"dropped_objects": dict(made.dropped.counts)} if made.dropped.counts else {}
     if num_derived := sum(index >= num_objects for index in made.row_of_box):
-        log.info(
-            "%s: %d boxes of pavement are added along streets (maps.boxes.derive_pavements)", path.name, num_derived
-        )
+        log.info("%s: %d boxes of pavements and crossings are added to streets", path.name, num_derived)
         changes |= {"added_boxes": num_derived, "derived_ground": num_derived}
     if set(made.size_sources) != {"file"}:
         changes["extent_sources"] = dict(made.size_sources)
@@ -263,74 +262,30 @@ def _read_rows(cfg: BoxesConfig, path: Path, *, is_table: bool) -> BoxMap:
     return box_map
 
 
-def _pavements_of(rows: list[_Row], cfg: BoxesConfig) -> list[_Row]:
-    """Return rows of pavements along the streets that have none according to their `sidewalk` properties.
-
-    Nothing is added on carriageways and mapped pavements.
-    """
-    paved: list[Any] = []  # areas of the mapped carriageways and pavements
-    streets = defaultdict[tuple[float, float, str], list[Any]](list)  # by width, side (1: left), and value of `bridge`
-    for row in rows:
-        try:
-            kind = _kind_of(row, cfg)
-            if row.problem or kind not in ("Roads", "Sidewalks"):
-                continue
-            width_m = _size_of(row, kind, cfg).numbers.get("width_m", 0.0)
-        except _Skipped:  # counted later
-            continue
-        is_line = "Line" in row.shape.geom_type
-        paved.append(row.shape.buffer(width_m / 2, cap_style="flat") if is_line else row.shape)
-        if is_line and kind == "Roads" and _type_of(row, cfg)[1] in STREETS_WITH_PAVEMENTS:
-            for side in _pavement_sides(row.values):
-                streets[width_m, side, str(row.values.get("bridge") or "no")] += shapely.get_parts(row.shape).tolist()
-    width_m, _ = DEFAULT_SIZES_M["Sidewalks"]
-    paved_area = shapely.union_all(paved).buffer(width_m / 4, join_style="mitre")  # as much as boxes of a line overlap
-    pavements: list[_Row] = []
-    for (street_m, side, bridge), lines in streets.items():
-        merged = shapely.get_parts(shapely.line_merge(shapely.multilinestrings(lines), directed=True))
-        edges = shapely.offset_curve(merged, side * (street_m + width_m) / 2, join_style="mitre")
-        free = [line for edge in edges for line in shapely.get_parts(edge.difference(paved_area))]
-        if free:
-            values = {cfg.type_columns[0]: "Sidewalks", "bridge": bridge}
-            pavements.append(_Row("a derived pavement", values, shapely.multilinestrings(free)))
-    return pavements
+def _completed(rows: list[_Row], cfg: BoxesConfig) -> list[_Row]:
+    """Return the rows of a map of streets as pedestrians meet it, and after them those of what is added."""
+    features, added = completed([_feature_of(row, cfg) for row in rows], STREETS_WITH_PAVEMENTS, cfg.derive_pavements)
+    completed_rows: list[_Row] = []
+    for row, feature in zip(rows, features, strict=True):
+        is_retyped = feature.kind == "RoadLines"  # a crossing
+        values = {cfg.type_columns[0]: feature.kind} if is_retyped else row.values
+        completed_rows.append(row if row.problem else row._replace(shape=feature.shape, values=values))
+    for feature in added:
+        completed_rows.append(_Row("an added surface", {cfg.type_columns[0]: feature.kind}, feature.shape))
+    return completed_rows
 
 
-def _pavement_sides(values: Mapping[str, Any]) -> list[float]:
-    """Return the sides of a street that may have a pavement: 1 for the left one, -1 for the right one."""
-    both = values.get("sidewalk") or values.get("sidewalk:both") or "both"
-    sides = {"left": 1.0, "right": -1.0}
-    if both in sides:
-        return [sides[both]]
-    default = "no" if both in WITHOUT_PAVEMENT else "yes"
-    found = {name: values.get(f"sidewalk:{name}") or default for name in sides}
-    return [sides[name] for name in sides if found[name] not in WITHOUT_PAVEMENT]
-
-
-def _opened_below_bridges(rows: list[_Row], cfg: BoxesConfig) -> list[_Row]:
-    """Return the rows with water cut out below ways with a `bridge` property, because nobody walks over water."""
-    areas: dict[int, Any] = {}  # of water and bridges, by row
-    waters, bridges = list[int](), list[int]()
-    for index, row in enumerate(rows):
-        try:
-            kind = _kind_of(row, cfg)
-            is_bridge = str(row.values.get("bridge") or "no") != "no" and KINDS[kind] in GROUND_KINDS
-            if row.problem or not (kind == "Water" or is_bridge):
-                continue
-            half_m = _size_of(row, kind, cfg).numbers.get("width_m", 0.0) / 2 if "Line" in row.shape.geom_type else 0.0
-        except _Skipped:  # counted later
-            continue
-        (bridges if is_bridge else waters).append(index)
-        areas[index] = row.shape.buffer(half_m + BRIDGE_EDGE_M * is_bridge, cap_style="flat")
-    bridge_area = shapely.union_all([areas[index] for index in bridges])
-    opened = list(rows)
-    near = bridge_area.buffer(BRIDGE_NEAR_M, cap_style="flat")
-    for index in waters:
-        if areas[index].intersects(bridge_area):
-            water = areas[index].difference(bridge_area)
-            parts = [*polygons_of(water.intersection(near)), *polygons_of(water.difference(near))]
-            opened[index] = rows[index]._replace(shape=shapely.multipolygons(parts))
-    return opened
+def _feature_of(row: _Row, cfg: BoxesConfig) -> Feature:
+    """Return a row as a feature, without a kind if the row cannot be used, which is counted later."""
+    unknown = Feature("", row.shape, tags=row.values)
+    if row.problem:
+        return unknown
+    try:
+        kind, value = _typed(row, cfg)
+        width_m = _size_of(row, kind, value, cfg).numbers.get("width_m", 0.0)
+    except _Skipped:
+        return unknown
+    return unknown._replace(kind=kind, value=value, width_m=width_m)
 
 
 def _make_boxes(rows: list[_Row], cfg: BoxesConfig) -> _BoxesOfRows:
@@ -343,7 +298,7 @@ def _make_boxes(rows: list[_Row], cfg: BoxesConfig) -> _BoxesOfRows:
     for index, row in enumerate(rows):
         num_before = len(boxes)
         try:
-            source = _add_row(boxes, row, cfg, made.repairs)
+            source = _add_row(made, row, cfg)
         except _Skipped as error:
             del boxes.rows[num_before:], boxes.kinds[num_before:]
             made.dropped.add(error.reason, row.where, str(error), is_bad=error.reason not in NOT_MAPPED)
@@ -368,6 +323,8 @@ def _check_and_report(made: _BoxesOfRows, rows: list[_Row], ids: list[int], cfg:
     dropped.check(path, len(rows) - sum(dropped.counts[reason] for reason in NOT_MAPPED), cfg.most_skipped, expected)
     if made.repairs:
         log.warning("%s: %s", path.name, listed(made.repairs, "the outline crosses itself and is repaired"))
+    if made.unread:
+        log.warning("%s: %s", path.name, listed(made.unread, "the value is not a number, so a default is used"))
     if made.size_sources["levels"] or made.size_sources["default"]:
         words = "%s: %d boxes have their size from the file, %d a height from their storeys, %d a default size"
         log.warning(words, path.name, *(made.size_sources[name] for name in ("file", "levels", "default")))
@@ -561,64 +518,64 @@ def _units_of(rows: list[_Row], coordinates: np.ndarray, units: Units, path: Pat
 # --- boxes of a row ---------------------------------------------------------------------------------------------------
 
 
-def _add_row(boxes: BoxList, row: _Row, cfg: BoxesConfig, repairs: list[str]) -> str:
-    """Add the boxes of a row; return the source of their sizes.
-
-    The place of a row whose outline is repaired is added to `repairs`. _Skipped is raised if a row cannot be used.
-    """
+def _add_row(made: _BoxesOfRows, row: _Row, cfg: BoxesConfig) -> str:
+    """Add the boxes of a row; return the source of their sizes. _Skipped is raised if a row cannot be used."""
+    boxes = made.boxes
     if row.problem:
         raise _Skipped(row.reason, row.problem)
-    kind = _kind_of(row, cfg)
-    size = _size_of(row, kind, cfg)
+    kind, value = _typed(row, cfg)
+    size = _size_of(row, kind, value, cfg)
     num_before = len(boxes)
     try:
         for part in shapely.get_parts(row.shape):
-            for center, sides_m, yaw_deg in _rectangles(part, size.numbers, row.where, repairs):
+            for center, sides_m, yaw_deg in _rectangles(part, size.numbers, row.where, made.repairs):
                 boxes.add(kind, center, sides_m, size.low_m, size.high_m, yaw_deg)
     except ValueError as error:  # so far from the origin that its size is lost
         raise _Skipped("bad_value", str(error)) from None
     if len(boxes) == num_before:
         raise _Skipped("no_area", "the outline has no area")
+    made.unread += [f"{row.where}: {text}" for text in size.unread]
     return size.source
 
 
-def _type_of(row: _Row, cfg: BoxesConfig) -> tuple[str, str]:
-    """Return the column of a row's type and its value, the first that is not empty."""
-    for column in cfg.type_columns:
-        if row.values.get(column):
-            return column, str(row.values[column])
-    return cfg.type_columns[0], ""
+def _typed(row: _Row, cfg: BoxesConfig) -> tuple[str, str]:
+    """Return the kind of a row and the value that gives it, of the first column that gives one.
 
-
-def _kind_of(row: _Row, cfg: BoxesConfig) -> str:
-    """Return the kind of a row; raise _Skipped if its type is unknown."""
-    column, name = _type_of(row, cfg)
-    kind = cfg.types.get(name, name)
-    if kind in TYPES:
-        return kind
-    if cfg.is_plain:
-        raise _Skipped("unknown_type", f"unknown type {name[:MOST_NAME]!r}{nearest(name, [*TYPES, *cfg.types])}")
-    if (row.values.get("tunnel") or "no") not in ("no", "building_passage"):
-        raise _Skipped("underground", "it is in a tunnel")
-    for rule in TYPE_RULES:
-        if rule.covers(column, name, row.shape.geom_type):
-            if rule.kind in TYPES:
-                return rule.kind
-            break  # such features have no boxes
-    if not name:
+    _Skipped: No column gives a kind.
+    """
+    if not cfg.is_plain and is_underground(row.values):
+        raise _Skipped("underground", "it is below the ground")
+    columns = [column for column in cfg.type_columns if row.values.get(column)] or cfg.type_columns[:1]
+    values = {column: str(row.values.get(column) or "") for column in columns}
+    for column, value in values.items():
+        kind = cfg.types.get(value, value)
+        if kind in TYPES:
+            return kind, value
+        if kind == NOTHING:
+            raise _Skipped("unmapped_type", f"maps.boxes.types drops {value[:MOST_NAME]!r}")
+        if cfg.is_plain:
+            raise _Skipped("unknown_type", f"unknown type {value[:MOST_NAME]!r}{nearest(value, [*TYPES, *cfg.types])}")
+        for rule in TYPE_RULES:
+            if rule.covers(column, value, row.shape.geom_type):
+                if rule.kind in TYPES:
+                    return rule.kind, value
+                break  # no boxes
+    if not any(values.values()):
         properties = ", ".join(row.values)[:80] or "none"
         problem = f"maps.boxes.type_column names no property of this feature, which has {properties}"
     else:
-        problem = f"there is no type for {column}={name[:MOST_NAME]!r}; maps.boxes.types can name one"
+        tags = ", ".join(f"{column}={value[:MOST_NAME]!r}" for column, value in values.items())
+        problem = f"there is no type for {tags}; maps.boxes.types can name one"
     raise _Skipped("unmapped_type", problem)
 
 
-def _size_of(row: _Row, kind: str, cfg: BoxesConfig) -> _Size:
-    """Return the size of a row's boxes: as declared, by its storeys and lanes, or the default of its kind."""
+def _size_of(row: _Row, kind: str, value: str, cfg: BoxesConfig) -> _Size:
+    """Return the size of a row's boxes: as declared, by its storeys and lanes, or the default of its value or kind."""
     values = {name: length_m(row.values[name]) for name in SIZES if row.values.get(name) is not None}
     values |= {name: _number(row.values[name]) for name in OTHERS if row.values.get(name) is not None}
     numbers = {name: number for name, number in values.items() if not math.isnan(number)}
-    not_finite = [name for name in values if name not in numbers] if cfg.is_plain else []
+    unread = [name for name in values if name not in numbers]
+    not_finite = unread if cfg.is_plain else []
     forms = {part.geom_type for part in shapely.get_parts(row.shape)}
     source = "file"
     if "height_m" not in numbers and "building:levels" in numbers:
@@ -636,7 +593,7 @@ def _size_of(row: _Row, kind: str, cfg: BoxesConfig) -> _Size:
     needed = [name for name in is_needed if is_needed[name]]
     if not cfg.is_plain and kind in DEFAULT_SIZES_M:
         width_m, height_m = DEFAULT_SIZES_M[kind]
-        defaults = {"length_m": width_m, "width_m": width_m, "height_m": above_m + height_m}
+        defaults = {"length_m": width_m, "width_m": WIDTHS_M.get(value, width_m), "height_m": above_m + height_m}
         if any(name not in numbers for name in needed):
             source = "default"
         is_slab = is_slab or ("height_m" not in numbers and height_m == SLAB_M)
@@ -652,7 +609,8 @@ def _size_of(row: _Row, kind: str, cfg: BoxesConfig) -> _Size:
     low_m = cfg.ground_z_m - SLAB_M if is_slab else cfg.ground_z_m + above_m
     if "z_m" in numbers:
         low_m = numbers["z_m"] - height_m / 2
-    return _Size(numbers, low_m, low_m + height_m, source)
+    texts = [f"{name}={str(row.values[name])[:MOST_NAME]!r}" for name in unread]
+    return _Size(numbers, low_m, low_m + height_m, source, texts)
 
 
 def _rectangles(part: Any, numbers: Mapping[str, float], where: str, repairs: list[str]) -> Iterator[Rectangle]:

@@ -1,0 +1,212 @@
+"""Features of OpenStreetMap and Overture to what a street is for pedestrians.
+
+Such data draw streets as lines: without pavements, with footways that end in the middle of the carriageway, crossings
+as nodes or lines, and rivers that run through bridges. Here streets get pavements and crossings get stripes, footways
+end at the kerb, and water is open below bridges. Rows of trees become trees, and closed walls stay lines.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+from shapely import LineString, Point
+
+from cosfly.formats.kinds import GROUND_KINDS, KINDS
+from cosfly.maps.footprints import Rectangle, polygons_of, rectangle_polygon
+
+PAVEMENT_CREDITS = "Pavements are derived by cosfly from the streets, not mapped."
+PAVEMENT_M = 2.0  # width
+WITHOUT_PAVEMENT = ("no", "none", "separate")  # values of `sidewalk`; separate: mapped as a way of its own
+BRIDGE_EDGE_M = 0.5  # at each side: the default of pedestrians.safety_radius_m
+BRIDGE_NEAR_M = 15.0  # water so near to a bridge is covered apart: a long rectangle would reach into the opening
+CROSSING_M = 3.0  # width of a crossing
+STRIPE_M = 0.5  # of paint, and as much between two stripes
+NODE_M = 1.0  # from a node of a crossing to its street
+LONGEST_CROSSING_M = 20.0  # a longer piece of a footway within a carriageway runs along it
+TREE_STEP_M = 8.0  # between the trees of a row
+
+
+class Feature(NamedTuple):
+    """A feature: its geometry in metres, and what its tags mean."""
+
+    kind: str  # empty: no boxes
+    shape: Any
+    value: str = ""  # of the tag that gives the kind
+    width_m: float = 0.0  # of a line
+    tags: Mapping[str, Any] = {}
+
+    @property
+    def is_line(self) -> bool:
+        return "Line" in self.shape.geom_type
+
+    @property
+    def is_bridge(self) -> bool:
+        return str(self.tags.get("bridge") or "no") != "no"
+
+    @property
+    def is_crossing(self) -> bool:
+        if self.tags.get("crossing") in ("no", "unmarked"):
+            return False
+        is_way = self.tags.get("footway") == "crossing" and self.is_line
+        return is_way or (self.tags.get("highway") == "crossing" and isinstance(self.shape, Point))
+
+    def area(self, edge_m: float = 0.0) -> Any:
+        """Return its outline; that of a line is wider by an edge at each side."""
+        if not self.is_line:
+            return self.shape.buffer(edge_m, cap_style="flat")
+        return self.shape.buffer(self.width_m / 2 + edge_m, cap_style="flat")
+
+
+def is_underground(tags: Mapping[str, Any]) -> bool:
+    """Return whether a feature is below the ground: in a tunnel, or marked so. A passage through a house is not."""
+    is_in_tunnel = (tags.get("tunnel") or "no") not in ("no", "building_passage")
+    is_below = str(tags.get("layer") or "").startswith("-") and tags.get("building") not in (None, "no")
+    return is_in_tunnel or is_below or tags.get("location") == "underground"
+
+
+def completed(
+    features: Sequence[Feature], with_pavements: Sequence[str], derive_pavements: bool
+) -> tuple[list[Feature], list[Feature]]:
+    """Return the features as pedestrians and drones meet them, in their order, and surfaces to add.
+
+    Args:
+        with_pavements: Values of the tag of a street that has pavements unless its other tags deny them.
+    """
+    changed = [_with_plain_shape(feature) for feature in features]
+    roads = [feature for feature in changed if feature.kind == "Roads" and feature.is_line]
+    carriageways = shapely.union_all([road.area() for road in roads])
+    shapely.prepare(carriageways)
+    added: list[Feature] = []
+    crossings: list[LineString] = []
+    for index, feature in sorted(enumerate(changed), key=lambda pair: not pair[1].is_line):  # nodes after ways
+        if feature.is_crossing:
+            lines = list(_crossing_lines(feature, roads, carriageways, crossings))
+            if not lines:
+                continue
+            crossings += lines
+            paint = Feature("RoadLines", shapely.multipolygons([stripe for line in lines for stripe in _stripes(line)]))
+            rest = feature.shape.difference(carriageways)
+            if rest.is_empty or not feature.is_line:
+                changed[index] = paint
+            else:
+                changed[index] = feature._replace(shape=rest)
+                added.append(paint)
+        elif feature.kind == "Sidewalks" and feature.is_line and not feature.is_bridge:
+            changed[index] = _up_to_kerbs(feature, carriageways)
+    if derive_pavements:
+        added += _pavements(changed, roads, carriageways, with_pavements)
+    return _opened_below_bridges(changed, added), added
+
+
+def _with_plain_shape(feature: Feature) -> Feature:
+    """Return a feature with a row of trees as points, and a closed barrier, which is exported as an area, as a line."""
+    if feature.value == "tree_row" and feature.is_line:
+        lines = shapely.get_parts(feature.shape)
+        trees = [
+            line.interpolate(along_m) for line in lines for along_m in np.arange(0.0, line.length + 1e-6, TREE_STEP_M)
+        ]
+        return feature._replace(shape=shapely.multipoints(trees))
+    if feature.kind in ("Walls", "Fences", "GuardRail") and "Polygon" in feature.shape.geom_type:
+        return feature._replace(shape=feature.shape.boundary)
+    return feature
+
+
+# --- crossings --------------------------------------------------------------------------------------------------------
+
+
+def _crossing_lines(
+    feature: Feature, roads: Sequence[Feature], carriageways: Any, others: Sequence[LineString]
+) -> Iterator[LineString]:
+    """Yield the lines of a crossing from kerb to kerb: of a way what lies on carriageways, of a node a perpendicular.
+
+    A node on another crossing has none.
+    """
+    if feature.is_line:
+        for line in shapely.get_parts(feature.shape.intersection(carriageways)):
+            if 1.0 < line.length <= LONGEST_CROSSING_M:
+                yield line
+        return
+    if any(other.distance(feature.shape) < CROSSING_M for other in others):
+        return
+    for road in roads:
+        if road.shape.distance(feature.shape) <= NODE_M:
+            along_m = road.shape.project(feature.shape)
+            before, after = (road.shape.interpolate(max(0.0, along_m + step_m)) for step_m in (-1.0, 1.0))
+            direction = np.array([after.x - before.x, after.y - before.y]) / before.distance(after)
+            across = np.array([-direction[1], direction[0]]) * road.width_m / 2
+            middle = np.array(feature.shape.coords[0])
+            yield LineString([middle - across, middle + across])
+            return
+
+
+def _stripes(line: LineString) -> Iterator[Any]:
+    """Yield the outlines of the stripes of a crossing along a line."""
+    start, end = np.array(line.coords[0]), np.array(line.coords[-1])
+    direction = (end - start) / np.hypot(*(end - start))
+    yaw_deg = float(np.degrees(np.arctan2(direction[1], direction[0])))
+    for along_m in np.arange(STRIPE_M, np.hypot(*(end - start)) - STRIPE_M / 2, 2 * STRIPE_M):
+        yield rectangle_polygon(Rectangle(tuple(start + along_m * direction), (STRIPE_M, CROSSING_M), yaw_deg))
+
+
+# --- pavements --------------------------------------------------------------------------------------------------------
+
+
+def _up_to_kerbs(feature: Feature, carriageways: Any) -> Feature:
+    """Return a footway without its pieces in carriageways, but for those that run along them."""
+    inside = shapely.get_parts(feature.shape.intersection(carriageways))
+    outside = shapely.get_parts(feature.shape.difference(carriageways))
+    rest = [line for line in inside if line.length > LONGEST_CROSSING_M] + outside.tolist()
+    return feature._replace(shape=shapely.multilinestrings(rest)) if rest else feature
+
+
+def _pavements(
+    features: Sequence[Feature], roads: Sequence[Feature], carriageways: Any, with_pavements: Sequence[str]
+) -> list[Feature]:
+    """Return pavements along streets that have none, where no carriageway and no other pavement lies."""
+    streets = defaultdict[tuple[float, float, str], list[Any]](list)  # by width, side (1: left), and value of `bridge`
+    for road in roads:
+        if road.value in with_pavements:
+            for side in _pavement_sides(road.tags):
+                key = road.width_m, side, str(road.tags.get("bridge") or "no")
+                streets[key] += shapely.get_parts(road.shape).tolist()
+    mapped = [feature.area() for feature in features if feature.kind == "Sidewalks"]
+    # The boxes of a line are longer than it by half of their width.
+    paved = shapely.union_all([carriageways, *mapped]).buffer(PAVEMENT_M / 4, join_style="mitre")
+    pavements: list[Feature] = []
+    for (street_m, side, bridge), lines in streets.items():
+        merged = shapely.get_parts(shapely.line_merge(shapely.multilinestrings(lines), directed=True))
+        edges = shapely.offset_curve(merged, side * (street_m + PAVEMENT_M) / 2, join_style="mitre")
+        free = [line for edge in edges for line in shapely.get_parts(edge.difference(paved))]
+        if free:
+            pavements.append(Feature("Sidewalks", shapely.multilinestrings(free), "", PAVEMENT_M, {"bridge": bridge}))
+    return pavements
+
+
+def _pavement_sides(tags: Mapping[str, Any]) -> list[float]:
+    """Return the sides of a street that may have a pavement: 1 for the left one, -1 for the right one."""
+    both = tags.get("sidewalk") or tags.get("sidewalk:both") or "both"
+    sides = {"left": 1.0, "right": -1.0}
+    if both in sides:
+        return [sides[both]]
+    default = "no" if both in WITHOUT_PAVEMENT else "yes"
+    found = {name: tags.get(f"sidewalk:{name}") or default for name in sides}
+    return [sides[name] for name in sides if found[name] not in WITHOUT_PAVEMENT]
+
+
+# --- bridges ----------------------------------------------------------------------------------------------------------
+
+
+def _opened_below_bridges(features: Sequence[Feature], added: Sequence[Feature]) -> list[Feature]:
+    """Return the features with water cut out below bridges, because nobody walks over water."""
+    bridges = [one for one in (*features, *added) if one.is_bridge and KINDS.get(one.kind) in GROUND_KINDS]
+    bridge_area = shapely.union_all([bridge.area(BRIDGE_EDGE_M) for bridge in bridges])
+    near = bridge_area.buffer(BRIDGE_NEAR_M, cap_style="flat")
+    opened = list(features)
+    for index, feature in enumerate(features):
+        if feature.kind == "Water" and (area := feature.area()).intersects(bridge_area):
+            water = area.difference(bridge_area)
+            parts = [*polygons_of(water.intersection(near)), *polygons_of(water.difference(near))]
+            opened[index] = feature._replace(shape=shapely.multipolygons(parts))
+    return opened
