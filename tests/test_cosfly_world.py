@@ -22,7 +22,7 @@ from cosfly.worldgen.plan import OBJECTS, PLAN_FORMAT, WorldPlan
 from cosfly.worldgen.rules import plan_by_rules
 from cosfly.worldgen.stage import WorldConfig, check_world, run
 from cosfly.worldgen.streets import PATTERNS
-from cosfly.worldgen.town import Town, build, of_kinds
+from cosfly.worldgen.town import Town, build, of_kinds, trees_of
 
 PROMPTS = list(csv.DictReader(Path(__file__).with_name("world_prompts.tsv").open(), delimiter="\t"))
 COUNTS = {"two": 2, "three": 3, "twelve": 12}
@@ -273,6 +273,38 @@ def test_positions_and_forms_are_not_used():
     for words in ("flats", "blocks of flats", "4 blocks of flats"):
         (kind,) = plan_by_rules(f"a town with {words}", 0)[0].buildings
         assert (kind.name, kind.count) == ("apartment block", 4 if "4" in words else None)
+
+
+def test_words_after_no_are_used_only_if_they_change_something():
+    for prompt, not_used in (
+        ("a town without houses", ["without houses"]),
+        ("a town without any sidewalks and no balconies", ["without any sidewalks", "no balconies"]),
+        ("a town with no towers, no park, without traffic and without a church", []),
+    ):
+        trace = plan_by_rules(prompt, 0)[1]
+        assert [words for words in trace["not_used"] if words.startswith(("no ", "without"))] == not_used
+        assert not set(not_used) & set(trace["used"])
+
+
+def test_a_few_counted_buildings_stand_among_others():
+    for prompt, is_whole in (("an old town with a warehouse", False), ("a suburb with 2 apartment blocks", False),
+                             ("a hamlet of 4 cottages", True), ("a port with 12 warehouses", True)):  # fmt: skip
+        assert by_rules(prompt).only_these == is_whole, prompt
+
+
+def test_trees_leave_a_pitch_free_and_jetties_touch_a_bank():
+    town = build(by_rules("a suburb with many trees, a football pitch, a river and 3 jetties"), "T", 1)
+    places = {name: [obj for obj in town.placed if obj.name == name] for name in ("football pitch", "jetty")}
+    (pitch,) = places["football pitch"]
+    trees = footprints(town.layout.select(trees_of(town.layout)))
+    assert (
+        shapely.distance(trees, shapely.Point(pitch.xy)).min()
+        > 0.5 * min(OBJECTS["football pitch"].size_m) * pitch.scale
+    )
+    assert len(places["jetty"]) == 3
+    jetties = footprints(town.placement.select(of_kinds(town.placement, "Static") & (town.placement.maxs[:, 2] < 1.0)))
+    at_bank = shapely.distance(jetties, town.network.water.boundary) < 0.1
+    assert np.count_nonzero(at_bank) == 3
 
 
 def test_an_edited_plan_gives_the_same_town_with_the_change(tmp_path):

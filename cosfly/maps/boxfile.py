@@ -121,7 +121,7 @@ class BoxesConfig(Config):
     type_column: str = Field(
         "type",
         min_length=1,
-        description="column of the type; building,highway,natural for OpenStreetMap: the first with a value counts, "
+        description="column of the type; building,highway,natural for OpenStreetMap: the first that gives a type counts, "
         "values become types by a list, other columns are ignored and sizes have defaults; class for Overture",
     )
     types: dict[str, str] = Field(

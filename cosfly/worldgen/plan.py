@@ -36,7 +36,7 @@ class Object(Record):
 
     name: str
     parts: tuple[ObjectPart, ...] = ()
-    where: Literal["open", "water", "layout"] = "open"
+    where: Literal["open", "water", "bank", "layout"] = "open"
     words: tuple[str, ...] = ()
     asset: str | None = None
     least_scale: float = 1.0

@@ -32,6 +32,7 @@ STOPS = set(_words(WORDS["stops"])) | POSITIONS
 ORDINARY = set(_words(WORDS["ordinary"]))
 FIELD_BOUNDS = {"gap_m": (0.05, 40.0), "street_m": (5.0, 40.0), "avenue_m": (5.0, 60.0), "parked_share": (0.0, 0.9)}
 SEVERAL, SEVERAL_OPEN = 4, 3  # objects, and open blocks, of a plural without a number
+FEW = 5  # fewer buildings than that are not a whole town, but stand among others
 STOREY_M = 3.2
 VARIED = {"blocks_along": (0.92, 1.08), "block_m": (0.85, 1.2), "gap_m": (0.92, 1.08)}  # range of random factors
 LOWEST_M, HIGHEST_M = 3.0, 450.0  # buildings of a plan
@@ -76,6 +77,16 @@ _SIZES = {
 _CARS = r"\b\d+ (?:[a-z-]+ )?cars(?: parked)?\b"  # a number, which is not used: "20 parked cars"
 _ABSENT = r"\b(?:no|without(?: any)?)\s+((?:(?! (?:but|and|with) )[^.,;:()])+)"  # "without any towers"
 _STOPS = "|".join(_longest_first(STOPS))
+# What can be absent. Nothing is done about other words after "no", such as "no balconies" or "no houses".
+_BUILDINGS = [
+    f"{name}, {row['words']}" for name, row in WORDS["buildings"].items() if name not in ("house", "building")
+]
+_CAN_BE_ABSENT = [
+    *("high", "tall", "vehicle", "traffic", "tree", "vegetation", "car", "cars"),
+    *WORDS["open"], *WORDS["water"], *OBJECTS, *(word for obj in OBJECTS.values() for word in obj.words),
+    *(word for words in _BUILDINGS for word in _words(words)),
+]  # fmt: skip
+_HAS_EFFECT = re.compile(rf"\b(?:{'|'.join(_longest_first(_CAN_BE_ABSENT))})(?:e?s|er|est)?\b")
 
 
 def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
@@ -117,7 +128,8 @@ class _Reader:
             fix = "用英文写这段描述, 或用 --planner URL 指定语言模型"
             raise InputError(what, where="PROMPT", got=repr(prompt[:60]), expected=expected, fix=fix)
         self.prompt = prompt
-        self.text = _normalized(prompt)  # what is not read yet
+        self.normalized = _normalized(prompt)
+        self.text = self.normalized  # what is not read yet
         self.plan: dict[str, Any] = WorldPlan().model_dump()  # its fields so far
         self.used: list[str] = []
         self.not_used: list[str] = []
@@ -228,6 +240,8 @@ class _Reader:
             self.not_used.append(match[0].strip())
         while match := self._take(_ABSENT):  # before the nouns: "without towers" names no tower
             self.absent += f"{match[1].strip()}, "
+            if not _HAS_EFFECT.search(match[1]):
+                self.not_used.append(match[0].strip())
         self.objects = self._take_objects()  # before buildings: a clock tower is no tower
         for word in _words(WORDS["lacking"]):  # before buildings: a control tower is none either
             if match := self._take(rf"(?:\b\d+ )?\b{word}s?\b"):
@@ -308,7 +322,7 @@ class _Reader:
         if "bridge" in self.objects:
             self.plan["bridges"] = self._within("number of bridges", self.objects["bridge"], 1, 10)
             self.plan["river_m"] = self.plan["river_m"] or WORDS["water"]["river"][1]
-        if any(OBJECTS[name].where == "water" for name in self.objects):
+        if any(OBJECTS[name].where in ("water", "bank") for name in self.objects):
             self.plan["river_m"] = self.plan["river_m"] or WORDS["water"]["harbour"][1]
         return has_open
 
@@ -335,6 +349,8 @@ class _Reader:
     def _set_buildings(self, settlement: dict[str, Any], choices: dict[str, str], has_open: bool) -> None:
         """Set the kinds of buildings. Where one that the settlement consists of is counted, there are no others."""
         factor = WORDS["groups"]["height"].get(choices.get("height"), {}).get("heights_m", 1.0)
+        counts = [count for count in self.buildings.values() if count is not None]
+        is_whole = sum(counts) >= FEW or any(f" of {count} " in self.normalized for count in counts)
         for name, count in self.buildings.items():
             row = WORDS["buildings"][name]
             footprint_m = row.get("footprint_m", self.plan["footprint_m"])
@@ -344,8 +360,8 @@ class _Reader:
             group = {"name": name, "count": count, "footprint_m": footprint_m, "heights_m": heights_m}
             self.plan["buildings"].append(group)
             is_main = not row.get("landmark") or name in _words(settlement.get("consists_of", ""))
-            if None not in self.buildings.values() and is_main and (count != 1 or len(self.buildings) == 1):
-                self.plan["only_these"] = True
+            if None not in self.buildings.values() and is_main:
+                self.plan["only_these"] = is_whole
         if self.plan["only_these"] and not has_open:
             self.plan |= {"plazas": 0, "greens": 0}
 

@@ -27,7 +27,7 @@ from cosfly.runtime.run_dir import StageFolder, Tally, hold_folder
 from cosfly.viz.topview import TopView, draw_labels, draw_map, png_bytes
 from cosfly.worldgen.plan import OBJECTS, PLAN_FORMAT, WorldPlan, assets
 from cosfly.worldgen.rules import plan_by_rules
-from cosfly.worldgen.town import CM_PER_M, Town, build, layout_nodes, of_kinds, placement_nodes, trees_of
+from cosfly.worldgen.town import CM_PER_M, MOST_OF_BLOCK, Town, build, layout_nodes, of_kinds, placement_nodes, trees_of
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +100,7 @@ def check_world(town: Town, plan: WorldPlan) -> list[WorldCheck]:
     for kind in kinds:
         if kind.count is not None:
             checks.append(_check(f"number of {kind.name}s", town.built[kind.name], 0.9 * kind.count, 1.1 * kind.count))
-    num_planned, num_open = plan.plazas + plan.greens, len(town.open_blocks)
+    num_planned, num_open = plan.plazas + plan.greens, len(_open_blocks(town, plan))
     checks.append(_check("plazas and green blocks", num_open, num_planned, max(num_planned, num_open)))
     if plan.highest_m is not None:
         highest_m = buildings.maxs[:, 2].max(initial=0.0)
@@ -210,7 +210,7 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     by_seed = "" if trace.get("pattern_is_named", True) else " (chosen by the seed)"
     water = f" and water {plan.river_m:g} m wide" if plan.river_m else ""
     counts = Counter([name for name, _ in _open_blocks(town, plan)] + [obj.name for obj in town.placed])
-    counts.update({kind.name: town.built[kind.name] for kind in plan.buildings})
+    counts.update({kind.name: town.built[kind.name] for kind in plan.kinds_of_buildings()})
     counts["parked car"] = int(of_kinds(town.layout, *CARS).sum())
     place = trace.get("settlement", "town")
     log.info("the %s has %s streets%s%s; placed: %s", place, plan.pattern, by_seed, water, counts_text(counts))
@@ -226,8 +226,10 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
 
 
 def _open_blocks(town: Town, plan: WorldPlan) -> list[tuple[str, shapely.Polygon]]:
-    """Return the open blocks that were asked for, with their names; others are for objects."""
-    return list(zip(["plaza"] * plan.plazas + ["green"] * plan.greens, town.open_blocks, strict=False))
+    """Return the open blocks that were asked for, with their names, but for those that objects fill."""
+    objects = shapely.union_all(footprints(town.placement.select(of_kinds(town.placement, "Buildings"))))
+    named = zip(["plaza"] * plan.plazas + ["green"] * plan.greens, town.open_blocks, strict=False)
+    return [(name, block) for name, block in named if objects.intersection(block).area < MOST_OF_BLOCK * block.area]
 
 
 def _picture(town: Town, plan: WorldPlan) -> bytes:

@@ -47,6 +47,8 @@ WIDEST_BLOCK_M = 150.0  # blocks grow up to this size for a large object
 PATH_HALF_M = 1.5  # half width of a path across a green
 GARDEN_SETBACK_M = 2.5  # houses that stand farther back have gardens, so their blocks are not paved
 HEIGHT_SHAPE = (1.3, 1.7)  # of the beta distribution of heights: few buildings are very low or very high
+MOST_OF_BLOCK = 0.5  # share of an open block that an object may cover if there is room elsewhere
+LONGEST_IN_WATER = 0.4  # length of a jetty, share of the river's width
 TREE_GOAL = 0.35  # place of the number of trees in its range
 
 Size = tuple[float, ...]
@@ -323,16 +325,34 @@ class Town:
 
     def _find_place(self, obj: Object, scales: list[float]) -> tuple[Rectangle, float] | None:
         """Return the outline and the scale of an object where there is room, else None."""
-        if obj.where == "water":
+        if obj.where in ("water", "bank"):
             bridges = shapely.union_all([
                 rectangle_polygon(bridge.rectangle((0.0, bridge.length_m), (-bridge.width_m, bridge.width_m)))
                 for bridge in self.network.bridges
             ])  # fmt: skip
-            return self._place_in(obj, shapely.difference(self.network.water, bridges), scales, 0.0)
-        for block in self.open_blocks:
+            water = shapely.difference(self.network.water, bridges)
+            if obj.where == "water":
+                return self._place_in(obj, water, scales, 0.0)
+            return self._place_at_bank(obj, water)
+        roomy = [block for block in self.open_blocks if math.prod(obj.size_m) < MOST_OF_BLOCK * block.area]
+        return (
+            self._place_in_blocks(obj, roomy, scales)
+            or self._place_on_lot(obj, scales)
+            or self._place_in_blocks(obj, self.open_blocks, scales)
+        )
+
+    def _place_in_blocks(
+        self, obj: Object, blocks: list[Polygon], scales: list[float]
+    ) -> tuple[Rectangle, float] | None:
+        """Return a place and the scale of an object in the first block with room; else None."""
+        for block in blocks:
             scaled_place = self._place_in(obj, block, scales, oriented_rectangle(block).yaw_deg)
             if scaled_place is not None:
                 return scaled_place
+        return None
+
+    def _place_on_lot(self, obj: Object, scales: list[float]) -> tuple[Rectangle, float] | None:
+        """Return a lot along a street and the scale of an object; else None."""
         for scale in scales:
             size = obj.size_m[0] * scale, obj.size_m[1] * scale
             lots = self._lots([size], rng_for(self.seed, "world", obj.name), setback_m=self.plan.setback_m)
@@ -340,6 +360,18 @@ class Town:
             if lot is not None:
                 return lot, scale
         return None
+
+    def _place_at_bank(self, obj: Object, water: BaseGeometry) -> tuple[Rectangle, float] | None:
+        """Return a place and the scale of an object that reaches from a bank into the water; else None."""
+        scale = min(1.0, LONGEST_IN_WATER * self.plan.river_m / obj.size_m[1])
+        bank = self.network.water.boundary.difference(self._outline.boundary.buffer(1.0))
+        near_bank = shapely.intersection(water, bank.buffer(scale * obj.size_m[1] + STEP_M))
+        scaled_place = self._place_in(obj, near_bank, [scale], 0.0)
+        if scaled_place is None:
+            return None
+        place, _ = scaled_place
+        start, end = np.array(shapely.shortest_line(rectangle_polygon(place), bank).coords)
+        return place._replace(center=tuple(np.array(place.center) + end - start)), scale
 
     def _place_in(
         self, obj: Object, area: BaseGeometry, scales: list[float], yaw_deg: float
@@ -389,7 +421,7 @@ class Town:
         boxes = BoxList()
         is_ground = of_kinds(world, "Roads", "Terrain", "RoadLines") | (world.maxs[:, 2] <= 0.0)
         is_path = of_kinds(world, "Sidewalks") & ((2 * world.half_extents[:, :2]).min(1) < 5.0)
-        obstacles = shapely.STRtree(footprints(world)[~is_ground | is_path])
+        obstacles = shapely.STRtree([*footprints(world)[~is_ground | is_path], *self._taken])  # and pitches
         shapely.prepare(self._blocks)
         low_x, low_y, high_x, high_y = self._blocks.bounds
         for xy in rng.uniform((low_x, low_y), (high_x, high_y), (40 * count, 2)):
