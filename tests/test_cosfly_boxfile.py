@@ -317,10 +317,12 @@ def test_tags_of_openstreetmap_mean_what_they_say(tmp_path, caplog):
         feature("Polygon", square(90, 0), building="yes", layer="-1"),
         feature("Polygon", square(120, 0), building="yes", location="underground"),
         feature("Polygon", square(150, 0), building="roof"),
+        feature("Polygon", [*square(180, 0, 40), *square(190, 12, 10)], building="yes"),
     ]
     columns = {"type_column": "building,natural,landuse,barrier", "units": "m", "types": {"roof": "NONE"}}
     made = loaded(tmp_path, collection(*features), ".geojson", **columns)
-    assert made.counts() == {"Vegetation": 6, "Walls": 4, "Buildings": 1}
+    assert made.counts() == {"Vegetation": 6, "Walls": 4, "Buildings": 1 + 10}
+    assert not any(footprint.contains(Point(195, 17)) for footprint in footprints(made))  # a yard of 6 %
     assert made.header.dropped_objects == {"underground": 2, "unmapped_type": 1}
     assert "height_m='ca. 9': the value is not a number, so a default is used" in caplog.text
 

@@ -79,6 +79,7 @@ DEFAULT_SIZES_M = {
 }  # fmt: skip
 FAR_M = 10_000.0  # a map with its middle farther from the origin is moved there
 OUTLINE_FILL = 0.9  # share of its boxes that an outline fills
+YARD_FILL = 0.98  # the same if it has holes, so that they stay open
 OUTLINE_PIECE_M = 3.0  # pieces of an outline that are no longer are not cut again
 TABLE_SETTINGS = {"types", "ignore", "ground_z_m", "units", "type_column"}  # settings that a boxes_3d.json ignores
 
@@ -121,7 +122,7 @@ class BoxesConfig(Config):
     type_column: str = Field(
         "type",
         min_length=1,
-        description="column of the type; building,highway,natural for OpenStreetMap: the first that gives a type counts, "
+        description="column of the type; building,highway,natural for OpenStreetMap: the first that gives a type, "
         "values become types by a list, other columns are ignored and sizes have defaults; class for Overture",
     )
     types: dict[str, str] = Field(
@@ -627,7 +628,8 @@ def _rectangles(part: Any, numbers: Mapping[str, float], where: str, repairs: li
                 yield Rectangle(tuple((start + end) / 2), (length + width_m / 2, width_m), yaw_deg)
     else:
         for polygon in _valid_polygons(part, where, repairs):
-            pieces = cover(polygon, min_fill=OUTLINE_FILL, min_size_m=OUTLINE_PIECE_M, shares=CUT_SHARES)
+            fill = YARD_FILL if polygon.interiors else OUTLINE_FILL
+            pieces = cover(polygon, min_fill=fill, min_size_m=OUTLINE_PIECE_M, shares=CUT_SHARES)
             if not pieces and polygon.area > 0:  # too small to be cut
                 rectangle = oriented_rectangle(polygon)
                 pieces = [rectangle] if min(rectangle.size) > THINNEST_M else []
