@@ -32,6 +32,7 @@ from cosfly.runtime.errors import nearest
 SLOT_MARK = "\ufffc"  # replaces a slot in the text without slots
 _BRACES = re.compile(r"\{([^{}]*)\}")
 _ARTICLE = re.compile(r"\b([Aa])n?\s+$")
+_AMOUNT = {"en": re.compile(r"\bby\s+$", re.IGNORECASE), "zh": re.compile(r"了\s*$")}
 _VERBS = ("target_motion", "drone_motion", "walking")
 _ALIASES = {  # what prompts call a slot -> its reference; "compared" is the comparison seen from the target
     "compare:drone_speed,target_speed": "comparison:speed",
@@ -90,6 +91,7 @@ def read_sentence(text: str, language: Language, num_frames: int) -> Sentence:
         texts[i + 1] = _without_repetition(slot, after, language)
         slots.append(slot)
     slots = _paired(slots, num_frames)
+    _check_amounts(slots, texts, language)
     outside = SLOT_MARK.join(texts)  # with the spaces and articles that the writer chose
     if language == "zh":  # a space before a number, none behind its unit
         texts[1:] = [re.sub(r"^ +(?=[\u4e00-\u9fff])", "", part) for part in texts[1:]]
@@ -182,6 +184,18 @@ def _direction_of(slot: Slot, num_frames: int) -> Direction | None:
     if aspect == "side" or (not aspect and has_sides(name)):
         return Direction(f"side:{name}", frame, frame)
     return None
+
+
+def _check_amounts(slots: list[Slot], texts: list[str], language: Language) -> None:
+    """Refuse a signed number where a word of the writer states its direction: "has fallen by -1.5 m"."""
+    for slot, before in zip(slots, texts, strict=False):
+        reference = slot.reference
+        if reference is None or slot.is_paired or reference.aspect not in ("change", "growth"):
+            continue
+        if _AMOUNT[language].search(before):
+            aspect = "side" if reference.quantity in TURNS or QUANTITIES[reference.quantity].sides else "trend"
+            word = reference._replace(aspect=aspect)
+            raise InvalidSlot(f"{{{slot.name}}}: name its direction in the same sentence with {{{word}}}")
 
 
 # --- words around a slot ----------------------------------------------------------------------------------------------

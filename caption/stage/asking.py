@@ -284,6 +284,7 @@ class RunProgress:
         self.windows = Tally()  # of this run
         self.num_repaired = 0
         self._num_recorded = 0  # windows of this run before its first new answer: earlier answers sufficed
+        self._num_used = 0  # answers of the other windows of this run
         self._start_s = self._answered_s = time.monotonic()
         self._num_answers = 0
         self._totals_before = budget.totals
@@ -299,6 +300,8 @@ class RunProgress:
         self.windows.input += 1
         if not self._answers["answers"]:
             self._num_recorded += 1
+        elif caption is not None:
+            self._num_used += caption.attempts
         if caption is None or caption.drop_reason == "refused":
             self.windows.failed["no_answer"] += 1
         elif caption.status == "accepted":
@@ -333,14 +336,17 @@ class RunProgress:
             f"dropped {windows.dropped.total():,}" + (f" ({reasons})" if reasons else ""),
             f"no answer {windows.failed.total():,}",
             f"answers {answers['answers']:,} in {duration(elapsed_s)}" + self._waiting(),
-            f"tokens {answers['prompt_tokens']:,} in {answers['completion_tokens']:,} out",
+            f"tokens {answers['prompt_tokens']:,} read {answers['completion_tokens']:,} written",
         ]
         if answers["cut"]:
-            figures.append(f"{answers['cut']:,} answers cut at max_tokens")
+            figures.append(f"cut at max_tokens {answers['cut']:,}")
         if prices.price_prompt or prices.price_completion:
             figures.append(f"cost {prices.cost(answers['prompt_tokens'], answers['completion_tokens']):.2f}")
         if num_asked := windows.input - self._num_recorded:
-            rate = num_asked / elapsed_s
+            # English answers come first, so some windows that are not finished have part of their answers.
+            per_window = max(self._num_used, num_asked) / num_asked
+            num_begun = min(max(0.0, answers["answers"] - self._num_used) / per_window, WAITING_WINDOWS, self.num_left)
+            rate = (num_asked + num_begun) / elapsed_s
             figures.append(f"{1 / rate:.0f} s per window" if rate < 1.0 else f"{rate:.1f} windows/s")
-            figures.append(f"{duration(self.num_left * elapsed_s / num_asked)} left")
+            figures.append(f"{duration((self.num_left - num_begun) / rate)} left")
         return ", ".join(figures)

@@ -138,10 +138,11 @@ def _finish(
         raise stage.nothing_kept(outcome.tracks, expected=f"a track of at least {num_frames} frames")
     if not tally.kept:
         causes = explain_drops(tally.dropped + tally.failed, report.rejected_answers)
-        fix = f"{causes}; use another model or other settings, and another --out"
+        fix = f"{causes}; see {out / PAGE}; use another model or other settings, and another --out"
         raise stage.nothing_kept(tally, where=out / PRODUCT, fix=fix)
     outputs = [out / PRODUCT, out / REPORT, out / PAGE, *sorted((out / ANSWERS).glob("*.jsonl"))]
     outputs += keep_own_prompts(out, vocabulary)
+    log.info("caption: examples and counts are in %s", out / PAGE)
     stage.finish(outputs, tally, flights=outcome.tracks.model_dump(), limit=cfg.limit if is_cut else None)
     _remove_parts(stage)
 

@@ -118,7 +118,8 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
             yield f"no answer: {for_terminal(str(outcome))}"
         if num_cut := sum(reply.finish_reason == "length" for _, reply in of_window):
             limit = f"caption.endpoint.max_tokens={cfg.endpoint.max_tokens}"
-            yield f"fix: {num_cut} of {len(of_window)} answers were cut at {limit}; raise it, or use a larger model"
+            fix = "raise it, or if the answers repeat themselves, use a larger model"
+            yield f"fix: {num_cut} of {len(of_window)} answers were cut at {limit}; {fix}"
     num_accepted = sum(isinstance(outcome, Caption) and outcome.status == "accepted" for outcome in outcomes)
     yield f"=== {num_accepted} of {len(windows)} windows accepted, {sum(map(len, exchanges.values()))} answers ==="
 

@@ -317,6 +317,8 @@ class WindowLoop:
                 return None
             self.checks.bilingual = answer.reason
             complaint = answer.complaint
+            if complaint:
+                self._refused.append(f"bilingual: {complaint}"[:MOST_REFUSAL_TEXT])
             if parsed.reason == CONTEXT_FULL:
                 break
         return "bilingual"

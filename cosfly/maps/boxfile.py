@@ -228,7 +228,7 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
         log.info("%s: the middle of the map, %s, becomes the origin", path.name, origin[:2].tolist())
         changes["offset_m"] = dict(zip("xyz", origin.tolist(), strict=True))
         box_map = replace(box_map, centers=box_map.centers - origin)
-    if box_map.header.derived_ground:
+    if suffix != ".json" and box_map.header.derived_ground:
         changes["credits"] = credits_with(PAVEMENT_CREDITS, cfg.credits)
     box_map = replace(box_map, header=box_map.header.model_copy(update=changes))
     return with_derived_ground(box_map) if cfg.derive_ground else box_map
@@ -265,7 +265,8 @@ def _read_rows(cfg: BoxesConfig, path: Path, *, is_table: bool) -> BoxMap:
 
 def _completed(rows: list[_Row], cfg: BoxesConfig) -> list[_Row]:
     """Return the rows of a map of streets as pedestrians meet it, and after them those of what is added."""
-    features, added = completed([_feature_of(row, cfg) for row in rows], STREETS_WITH_PAVEMENTS, cfg.derive_pavements)
+    with_pavements = STREETS_WITH_PAVEMENTS if cfg.derive_pavements else []
+    features, added = completed([_feature_of(row, cfg) for row in rows], with_pavements)
     completed_rows: list[_Row] = []
     for row, feature in zip(rows, features, strict=True):
         is_retyped = feature.kind == "RoadLines"  # a crossing

@@ -15,6 +15,7 @@ from shapely import LineString, Point
 
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
 from cosfly.maps.footprints import Rectangle, polygons_of, rectangle_polygon
+from cosfly.runtime.io import over_limit
 
 PAVEMENT_CREDITS = "Pavements are derived by cosfly from the streets, not mapped."
 PAVEMENT_M = 2.0  # width
@@ -26,6 +27,8 @@ STRIPE_M = 0.5  # of paint, and as much between two stripes
 NODE_M = 1.0  # from a node of a crossing to its street
 LONGEST_CROSSING_M = 20.0  # a longer piece of a footway within a carriageway runs along it
 TREE_STEP_M = 8.0  # between the trees of a row
+MOST_TREES = 50_000
+MOST_CROSSINGS, MOST_CROSSINGS_PER_STREET = 10_000, 50  # of the streets of a map
 
 
 class Feature(NamedTuple):
@@ -40,6 +43,10 @@ class Feature(NamedTuple):
     @property
     def is_line(self) -> bool:
         return "Line" in self.shape.geom_type
+
+    @property
+    def is_tree_row(self) -> bool:
+        return self.value == "tree_row" and self.is_line
 
     @property
     def is_bridge(self) -> bool:
@@ -66,16 +73,17 @@ def is_underground(tags: Mapping[str, Any]) -> bool:
     return is_in_tunnel or is_below or tags.get("location") == "underground"
 
 
-def completed(
-    features: Sequence[Feature], with_pavements: Sequence[str], derive_pavements: bool
-) -> tuple[list[Feature], list[Feature]]:
+def completed(features: Sequence[Feature], with_pavements: Sequence[str]) -> tuple[list[Feature], list[Feature]]:
     """Return the features as pedestrians and drones meet them, in their order, and surfaces to add.
 
     Args:
         with_pavements: Values of the tag of a street that has pavements unless its other tags deny them.
+    Raises:
+        InputError: The work is out of proportion to the file.
     """
+    roads = [feature for feature in features if feature.kind == "Roads" and feature.is_line]
+    _check_work(features, [road.shape for road in roads])
     changed = [_with_plain_shape(feature) for feature in features]
-    roads = [feature for feature in changed if feature.kind == "Roads" and feature.is_line]
     carriageways = shapely.union_all([road.area() for road in roads])
     shapely.prepare(carriageways)
     added: list[Feature] = []
@@ -95,14 +103,27 @@ def completed(
                 added.append(paint)
         elif feature.kind == "Sidewalks" and feature.is_line and not feature.is_bridge:
             changed[index] = _up_to_kerbs(feature, carriageways)
-    if derive_pavements:
-        added += _pavements(changed, roads, carriageways, with_pavements)
+    added += _pavements(changed, roads, carriageways, with_pavements)
     return _opened_below_bridges(changed, added), added
+
+
+def _check_work(features: Sequence[Feature], streets: Sequence[Any]) -> None:
+    """Raise InputError if rows have too many trees, or streets cross each other too often."""
+    fix = "cut out a part of the map"
+    num_trees = sum(feature.shape.length for feature in features if feature.is_tree_row) / TREE_STEP_M
+    if num_trees > MOST_TREES:
+        raise over_limit("map", f"rows of {num_trees:,.0f} trees", f"{MOST_TREES:,} trees", fix)
+    tree = shapely.STRtree(streets)
+    num_crossings, most = 0, MOST_CROSSINGS + MOST_CROSSINGS_PER_STREET * len(streets)
+    for street in streets:
+        num_crossings += len(tree.query(street, predicate="intersects"))
+        if num_crossings > most:
+            raise over_limit("map", f"streets with more than {most:,} crossings", f"{most:,} for their number", fix)
 
 
 def _with_plain_shape(feature: Feature) -> Feature:
     """Return a feature with a row of trees as points, and a closed barrier, which is exported as an area, as a line."""
-    if feature.value == "tree_row" and feature.is_line:
+    if feature.is_tree_row:
         lines = shapely.get_parts(feature.shape)
         trees = [
             line.interpolate(along_m) for line in lines for along_m in np.arange(0.0, line.length + 1e-6, TREE_STEP_M)
@@ -131,7 +152,7 @@ def _crossing_lines(
     if any(other.distance(feature.shape) < CROSSING_M for other in others):
         return
     for road in roads:
-        if road.shape.distance(feature.shape) <= NODE_M:
+        if road.width_m <= LONGEST_CROSSING_M and road.shape.distance(feature.shape) <= NODE_M:
             along_m = road.shape.project(feature.shape)
             before, after = (road.shape.interpolate(max(0.0, along_m + step_m)) for step_m in (-1.0, 1.0))
             direction = np.array([after.x - before.x, after.y - before.y]) / before.distance(after)
