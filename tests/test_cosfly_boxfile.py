@@ -308,6 +308,15 @@ def test_crossings_have_stripes_and_footways_end_at_the_kerb(tmp_path):
     assert made.header.dropped_objects == {"unmapped_type": 1}
 
 
+def test_streets_and_rows_out_of_proportion_are_refused(tmp_path):
+    ends = [([[0, 3 * k], [900, 3 * k]], [[3 * k, 0], [3 * k, 900]]) for k in range(300)]
+    grid = [feature("LineString", line, highway="residential") for lines in ends for line in lines]
+    rows = [feature("LineString", [[0, k], [19_000, k]], natural="tree_row") for k in range(30)]
+    for features, words in ((grid, "streets with more than"), (rows, "rows of 71,250 trees")):
+        with pytest.raises(InputError, match=words):
+            loaded(tmp_path, collection(*features), ".geojson", type_column="highway,natural", units="m")
+
+
 def test_tags_of_openstreetmap_mean_what_they_say(tmp_path, caplog):
     yard = square(0, 0, 20)
     features = [

@@ -550,7 +550,7 @@ def _check_finished(path: Path) -> None:
     for name in RECORDS:
         if not _record(folder, name):
             raise VerifyError(
-                "the stage that makes this input is not finished, or its records are missing",
+                "the stage that makes this input is not finished or kept nothing, or its records are missing",
                 where=path,
                 got=f"no {name} in {folder}",
                 expected="a finished stage",
