@@ -143,9 +143,7 @@ def test_of_many_tracks_whole_trajectories_are_shown(run_folder, tmp_path):
 
 @pytest.fixture(scope="module")
 def tab(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("chromium") / "profile"
-    folder.mkdir()
-    with browser(folder) as opened:
+    with browser(tmp_path_factory.mktemp("chromium") / "profile") as opened:
         yield opened
 
 
