@@ -60,8 +60,6 @@ def test_instance_ids_are_the_boxes_own_where_they_fit_and_leave_those_of_others
     boxes = numbered([5, MAX_BOX_ID, 1])
     assert (instance_ids(boxes).tolist(), has_own_ids(boxes)) == ([5, MAX_BOX_ID, 1], True)
     assert instance_ids(numbered([0, 1])).tolist() == [1, 2]
-    assert not has_own_ids(boxes, num_others=1)
-    assert instance_ids(boxes, num_others=1).tolist() == [1, 2, 3]
     ids = instance_ids(numbered(np.arange(MAX_BOX_ID + 5) + 1), num_others=20)
     others = [other_id(number) for number in range(20)]
     assert np.isin(ids, [*others, PERSON_ID, 0]).sum() == 0
