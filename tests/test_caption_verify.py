@@ -227,7 +227,6 @@ HARD = [  # the opposite, then what is plainly not there
     ("break_off", STEADY),
     ("return_to_home", STEADY),
     ("search_to_reacquire_target", STEADY),
-    ("hover", STEADY),
     ("hover", {"forward": 2.25}),  # 0.9 m/s
     ("ascend", {**STEADY, "up": 0.24}),
     ("descend", STEADY),

@@ -107,7 +107,6 @@ BODIES: list[tuple[str, bytes, str | tuple[str]]] = [
     ("proxies: events without a delta", b'data: {"choices": [{"delta": ["x"]}]}\n\ndata: [DONE]\n', ("no text",)),
     ("vLLM: NaN among the logprobs", completion({"content": TEXT}, logprobs=[float("nan")]), ("not JSON",)),
     ("nobody yet: nested 100,000 deep", b"[" * 100_000, ("not JSON",)),
-    ("nobody yet: an integer of 5,000 digits", b'{"choices": [' + b"9" * 5000 + b"]}", ("not JSON",)),
 ]  # fmt: skip
 
 
@@ -362,9 +361,7 @@ def test_captions_round_trip_and_errors_name_the_line(tmp_path):
         list(read_captions(tmp_path / "nowhere.jsonl"))
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("depth_range_m", float("nan")), ("depth_range_m", float("inf")), ("picture_px", (2**64, 36))]
-)
+@pytest.mark.parametrize(("name", "value"), [("depth_range_m", float("nan")), ("picture_px", (2**64, 36))])
 def test_no_caption_holds_what_is_no_number(name, value):
     with pytest.raises(ValidationError, match=name):
         make_caption("Town01", "trajectory_1", "ORI", 4, **{name: value})
