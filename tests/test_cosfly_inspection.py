@@ -110,8 +110,7 @@ def test_what_a_tree_was_never_to_have_is_not_missing(workplace):
     for folder in (lost, never):
         for path in [*folder.rglob("depth.npy"), *folder.rglob("instance.png")]:
             path.unlink()
-    names = [p.relative_to(never).as_posix() for p in never.rglob("*") if p.is_file() and p.name != CHECKSUMS]
-    write_checksums(never, {name: sha256_file(never / name) for name in names})
+    list_files(never)
     found = inspect(workplace)
     assert codes_of(found, lost)["missing_file"] == "error"
     assert codes_of(found, never) == {"not_in_this_tree": "note"}
@@ -198,7 +197,7 @@ def test_what_hides_or_holds_the_person_is_found(workplace):
 
 def edit_image(path: Path, change) -> None:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    cv2.imwrite(str(path), change(image))
+    cv2.imwrite(str(path), change(image).astype(np.uint8))
 
 
 def instances(change):
@@ -226,12 +225,7 @@ def at_point(key, name, value):
 def record_masks(folder: Path, wrong: dict[int, list[float] | None]) -> None:
     boxes = [mask_box(read_instance(folder / frame_name(i))[0] == 12) for i in range(NUM_POINTS)]
     named = {i: None if np.isnan(box).any() else box.tolist() for i, box in enumerate(boxes)} | wrong
-
-    def change(trajectory):
-        for i, box in named.items():
-            trajectory["points"][i]["target"]["mask_bbox_2d"] = box
-
-    told(change)(folder)
+    told(lambda t: [t["points"][i]["target"].update(mask_bbox_2d=box) for i, box in named.items()])(folder)
 
 
 FRAME = frame_name(3)
@@ -287,7 +281,7 @@ def paint(folder: Path, color: tuple[int, int, int], *, grain: bool) -> None:
     def change(image: np.ndarray) -> np.ndarray:
         image[surface] = color
         noise = np.random.default_rng(0).integers(-6, 7, image.shape)
-        grainy = np.clip(image.astype(int) + noise, 0, 255).astype(np.uint8)
+        grainy = np.clip(image.astype(int) + noise, 0, 255)
         return grainy if grain else np.where(surface[..., None], image, grainy)
 
     edit_image(folder / FRAME / "rgb.png", change)
@@ -296,12 +290,7 @@ def paint(folder: Path, color: tuple[int, int, int], *, grain: bool) -> None:
 def let_fight(folder: Path) -> None:
     surface = largest_surface(folder)
     surface[:, ::2] = False
-
-    def change(image: np.ndarray) -> np.ndarray:
-        image[surface] = (1, 77, KINDS["Walls"])
-        return image
-
-    instances(change)(folder)
+    instances(lambda image: np.where(surface[..., None], (1, 77, KINDS["Walls"]), image))(folder)
 
 
 def gone(depth: np.ndarray) -> np.ndarray:
@@ -344,7 +333,7 @@ def test_far_is_far(workplace, form):
     path.unlink()
     (folder / FRAME / name).write_bytes(data)
     sky = (0, 0, KINDS["Sky"])
-    instances(lambda image: np.where(top_row[..., None], sky, image).astype(np.uint8))(folder)
+    instances(lambda image: np.where(top_row[..., None], sky, image))(folder)
     assert codes_of(inspect(workplace, NO_SUMS), folder) == {}
     assert read_depth(folder / FRAME).max() == 1000.0
 

@@ -27,6 +27,7 @@ from specimens_release import (
     rows_by_id,
     source_of,
 )
+from test_cosfly_inspection import list_files
 
 from caption.schema import CaptionConfig
 from caption.stage import stage as caption_stage
@@ -39,7 +40,6 @@ from cosfly.formats.town import write_town_map
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.trajectory_metrics import derivative_rms, length_m
 from cosfly.runtime.errors import ConfigError, InputError, NothingKept, VerifyError
-from cosfly.runtime.io import sha256_file, write_checksums
 from cosfly.runtime.json_io import read_json
 from release.build.config import ReleaseConfig
 from release.build.shards import points_part
@@ -112,9 +112,7 @@ def test_splits_share_no_walk_and_no_twins(tmp_path):
 
 
 def test_a_track_that_two_runs_have_is_released_once(copy, tmp_path):
-    for folder in find_tracks(copy / "tree"):
-        files = [path for path in folder.rglob("*") if path.is_file()]
-        write_checksums(folder, {path.relative_to(folder).as_posix(): sha256_file(path) for path in files})
+    list_files(copy / "tree")
     other = shutil.copytree(copy, tmp_path / "other")
     product = run(split_cfg(), [source_of(copy), source_of(other, "two")], tmp_path / "r")
     counts = json.loads((tmp_path / "r/manifest.json").read_text())["counts"]
