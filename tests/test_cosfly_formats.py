@@ -166,12 +166,6 @@ def crowd(rng: np.random.Generator) -> tuple[dict[int, Appearance], SeenFrame]:
     return people, picture_of(dict(zip(seen, rng.permutation(np.arange(1, 59))[: len(seen)].tolist(), strict=True)))
 
 
-def stands_apart(relation: str, picture: SeenFrame, number: int, rivals: list[int]) -> bool:
-    where = {n: int(np.nonzero(picture.ids == n)[1][0]) for n in (number, *rivals)}
-    sign = {"left": 1, "right": -1}[relation]
-    return all(sign * where[number] < sign * where[n] for n in rivals)
-
-
 def test_a_goal_is_true_of_the_target_alone_and_says_what_is_seen():
     rng = np.random.default_rng(3)
     relations = set()
@@ -187,7 +181,9 @@ def test_a_goal_is_true_of_the_target_alone_and_says_what_is_seen():
         slots, relation = [s for s in says if s not in SIDES], [s for s in says if s in SIDES]
         rivals = [n for n in people if n not in (PERSON_ID, 1) and not {*slots} & {*target.differences(people[n])}]
         assert len(relation) == bool(rivals)  # a place is said where garments do not do
-        assert all(stands_apart(relation[0], picture, PERSON_ID, rivals) for _ in relation)
+        for side in relation:
+            own, *others = (int(np.nonzero(picture.ids == n)[1][0]) for n in (PERSON_ID, *rivals))
+            assert own < min(others) if side == "left" else own > max(others)
         relations |= {*relation}
     assert {"left", "right"} <= relations
 

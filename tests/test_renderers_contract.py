@@ -94,12 +94,6 @@ def circling(n: int = 6, path_id: str = "path_000", drop_reason: str | None = No
     return along_the_pavement(away, path_id, drop_reason)
 
 
-def behind_a_wall() -> DroneTrace:
-    """The drone sinks on the other side of a wall until the person is hidden."""
-    away = np.stack([np.zeros(8), np.full(8, -13.0), np.linspace(5.0, -0.4, 8)], axis=1)
-    return along_the_pavement(away, "path_007")
-
-
 def write_inputs(folder: Path, traces: list[DroneTrace]) -> list[Path]:
     folder.mkdir(exist_ok=True)
     write_boxes(folder / "boxes_3d.json", street())
@@ -428,7 +422,9 @@ def _digest_in_process(name: str) -> str:
 
 
 def test_a_whole_flight_has_the_annotations_of_the_default_renderer(renderer_name, tmp_path):
-    inputs = write_inputs(tmp_path / "in", [circling(4), behind_a_wall()])
+    # On the other side of a wall the drone sinks until the person is hidden.
+    sinking = np.stack([np.zeros(8), np.full(8, -13.0), np.linspace(5.0, -0.4, 8)], axis=1)
+    inputs = write_inputs(tmp_path / "in", [circling(4), along_the_pavement(sinking, "path_007")])
     tree, reference = (
         run(build(RenderConfig, {**DRAWN, "backend": name}, "test"), *inputs, tmp_path / out, seed=5)
         for name, out in ((renderer_name, "tree"), ("gl", "reference"))
