@@ -23,10 +23,8 @@ from cosfly.formats.frames import (
     TargetMeta,
     camera_meta,
     depth_bytes,
-    depth_file,
     frame_name,
     instance_bytes,
-    read_depth,
     rgb_bytes,
 )
 from cosfly.formats.kinds import KINDS
@@ -241,13 +239,6 @@ def change_json(path: Path, change: Callable[[Any], object]) -> None:
     change(value)
     path.unlink()  # it may be a link
     path.write_text(json.dumps(value))
-
-
-def pack_depth(folder: Path) -> None:
-    for path in folder.rglob("depth.npy"):
-        name, data = depth_file(read_depth(path.parent), "png")
-        path.with_name(name).write_bytes(data)
-        path.unlink()
 
 
 def _write_frame(folder: Path, flight: Track, scene: Scene, i: int) -> None:
