@@ -201,9 +201,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], object]]] = {
     "distill train": ["distill train {set} --student {students}/student --out {out} {training}"],
     "distill infer": ["distill infer {set} --model {students}/student --out {out} {small}"],
     "distill merge": ["distill merge --model {students}/student --adapter {trained}/adapter --out {out}"],
-    "distill evaluate": [
-        "distill evaluate --dataset {students}/set --predictions {inferred}/predictions.jsonl --out {out}"
-    ],
+    "distill evaluate": ["distill evaluate --dataset {students}/set --predictions {inferred} --out {out}"],
     "run": ["run quickstart --out {out} {tiny}"],
     "run, towns": ["run quickstart --out {out} {tiny} {towns}"],
     "run, towns, release": [  # the release alone is left to do
