@@ -151,9 +151,7 @@ ONE = "--set caption.endpoint.max_tries=1 --set fly.side_by_side=3"
 @pytest.mark.parametrize(
     ("fault", "answer"), [("wrong_decision", "invalid"), ("wrong_shape", "unreadable"), ("empty_choices", "none")]
 )
-def test_what_a_model_answers_wrong_is_its_own_failure_and_the_flight_goes_on(
-    town, tmp_path, in_this_process, fault, answer
-):
+def test_what_a_model_answers_wrong_ends_no_flight(town, tmp_path, in_this_process, fault, answer):
     with TeacherServer(lambda number, body: fault) as server:
         flown = fly(town, tmp_path, f"{SHORT} {ONE} --student {server.url}")
     for record in flown.values():
@@ -218,9 +216,8 @@ def test_a_student_can_answer_with_its_decision_alone(town, tmp_path, in_this_pr
     assert "works only with fly.student=transformers" in str(refused.exception)
     refused = attempt(town, tmp_path / "refused", f"{SHORT} {few} --student transformers:{last}")
     assert "writes its reasons before its decision" in str(refused.exception)
-    texts = itertools.cycle(
-        ['{"flight_decision": "move_forward', "{'flight_decision': \"Hover", '{"flight_decision": "up', "?"]
-    )
+    begin = '{"flight_decision": "'
+    texts = itertools.cycle([f"{begin}move_forward", "{'flight_decision': \"Hover", f"{begin}up", "?"])
 
     def answers(student, rows, pictures, *, max_tokens, stop, advance):
         assert stop == '",'

@@ -387,10 +387,8 @@ def test_a_refusal_is_read_as_what_it_means():
 
 
 def test_a_request_that_is_sent_back_does_not_name_its_own_fault():
-    echoed = json.dumps(
-        {"detail": "Bad Request", "input": "x" * MOST_CHARACTERS + "maximum context length, json_schema"}
-    )
-    assert kind_of(400, echoed) == "unknown"
+    sent = "x" * MOST_CHARACTERS + "maximum context length, json_schema"
+    assert kind_of(400, json.dumps({"detail": "Bad Request", "input": sent})) == "unknown"
 
 
 def test_a_server_that_is_away_may_come_back_and_a_request_that_is_refused_stays_refused():

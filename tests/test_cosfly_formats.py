@@ -100,9 +100,8 @@ def test_path_and_trace_round_trip(tmp_path, write, read, made, group, pace):
 def test_the_most_alike_differs_least_the_greatest_id_of_several():
     target = Appearance("man", "jacket", "red", "shorts", "blue")
     one, two = (Appearance("man", "jacket", color, "shorts", color) for color in ("red", "green"))
-    people = People(
-        target, {9: two, 8: one, 7: one, 6: Appearance("woman", "coat", "pink", "trousers", "pink", "cap", "red")}
-    )
+    stranger = Appearance("woman", "coat", "pink", "trousers", "pink", "cap", "red")
+    people = People(target, {9: two, 8: one, 7: one, 6: stranger})
     assert people.most_alike([9, 8, 7, 6]) == (8, 1)
     assert people.most_alike([6, 9]) == (9, 2)
     assert people.most_alike([6]) == (6, 4)

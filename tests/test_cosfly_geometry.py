@@ -296,10 +296,6 @@ def walk(num_points: int, *, begin: tuple[float, float] = (0.0, 0.0)):
     return time_s, np.column_stack([begin[0] + 1.4 * time_s, np.full(num_points, begin[1]), np.full(num_points, 0.9)])
 
 
-def course(name: str, points) -> Course:
-    return Course(name, "Town01", *points)
-
-
 def groups(*courses: Course) -> list[set[str]]:
     found: dict[str, set[str]] = {}
     for name, walk_id in walks_of(courses).items():
@@ -328,12 +324,13 @@ def test_perturbed_twins_are_one_walk_once_they_are_read_again(tmp_path):
 def test_near_for_half_of_the_time_and_five_seconds_or_all_the_time_is_one_walk(num_s, near_s, beside_m, is_one):
     time_s, places_m = walk(2 * num_s)
     beside = np.where(time_s < near_s, beside_m, 9.0)[:, None] * [0.0, 1.0, 0.0]
-    assert (len(groups(course("a", (time_s, places_m)), course("b", (time_s, places_m + beside)))) == 1) == is_one
+    one, other = (Course(name, "Town01", time_s, at_m) for name, at_m in (("a", places_m), ("b", places_m + beside)))
+    assert (len(groups(one, other)) == 1) == is_one
 
 
 def test_walks_go_from_neighbour_to_neighbour_and_have_the_first_name():
     y_m = {"c": 0.0, "a": 0.4, "b": 0.8, "d": 1.4}
-    courses = [course(name, walk(9 + k, begin=(0.0, at_m))) for k, (name, at_m) in enumerate(y_m.items())]
+    courses = [Course(name, "Town01", *walk(9 + k, begin=(0.0, at_m))) for k, (name, at_m) in enumerate(y_m.items())]
     assert walks_of(courses) == {"a": "a", "b": "a", "c": "a", "d": "d"}
 
 

@@ -173,9 +173,8 @@ def test_smooth_perturbations_keep_probabilities_and_move_as_a_drone_and_a_walke
     drawn = np.array([[state["position"] != "none", state["rotation"] != "none"] for state in after.states])
     np.testing.assert_allclose(drawn.mean(axis=0), [0.6, 0.6], atol=0.1)
     order = None if sampling == "spherical" else np.inf
-    for offsets_m, radius_m in (
-        (after.drone_offsets_m, cfg.drone_radius_m), (after.target_offsets_m[:, :2], cfg.pedestrian_radius_m)
-    ):  # fmt: skip
+    walked_m = after.target_offsets_m[:, :2]
+    for offsets_m, radius_m in ((after.drone_offsets_m, cfg.drone_radius_m), (walked_m, cfg.pedestrian_radius_m)):
         assert 0.8 * radius_m < np.linalg.norm(offsets_m, ord=order, axis=1).max() <= radius_m + 1e-9
         steps = np.diff(offsets_m, axis=0)
         speeds_mps = np.linalg.norm(steps, axis=1) / dt_s
