@@ -260,9 +260,7 @@ DEFECTS = {
     "teleport": at_point("drone_pose", "x", 99.0),
     "broken_annotation of another frame": lambda f: change_json(f / FRAME / "meta.json", lambda m: m.update(index=4)),
     "broken_image of instances": instances(lambda image: image[:54, :96]),
-    "broken_image in grey": lambda f: cv2.imwrite(
-        str(f / FRAME / "rgb.png"), np.arange(192 * 108, dtype=np.uint8).reshape(108, 192)
-    ),
+    "broken_image in grey": lambda f: cv2.imwrite(str(f / FRAME / "rgb.png"), np.eye(108, 192, dtype=np.uint8)),
     "checksum of the list": lambda f: (f / "checksums.sha256").write_text("frame_00003"),
     "depth_range everywhere": depths(lambda d: d * 0 + 7),
 }
@@ -422,11 +420,8 @@ def test_an_unreadable_flight_is_a_counted_failure_while_others_go_on(workplace)
 
 def test_the_funnel_counts_prefiltered_and_unrendered_plans(workplace):
     plans = [plan_of(f) for f in find_tracks(workplace / "tree") if f.name == "ORI"]
-    extra = [
-        replace(plans[0], path_id="low", drop_reason="five_ray_visibility"),
-        replace(plans[0], path_id="rough", drop_reason="smoothness"),
-        replace(plans[0], path_id="lost"),
-    ]
+    reasons = {"low": "five_ray_visibility", "rough": "smoothness", "lost": None}
+    extra = [replace(plans[0], path_id=name, drop_reason=reason) for name, reason in reasons.items()]
     write_traces(workplace / "drone_trace.json", plans + extra, {})
     funnel = inspect(workplace).funnel.trajectories
     assert (funnel.planned, funnel.rendered, funnel.not_rendered) == (5, 2, 1)

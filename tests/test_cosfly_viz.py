@@ -338,8 +338,7 @@ def click_at(page: Page, *places: list[float]) -> None:
 
 
 def pixel_of(page: Page, place: list[float]) -> tuple[float, float]:
-    x, y = page.run(f"window.editor.map.at({json.dumps(place)})")
-    return x, y  # the board begins at the window's corner
+    return tuple(page.run(f"window.editor.map.at({json.dumps(place)})"))  # the board begins at the window's corner
 
 
 def settled(page: Page) -> None:
