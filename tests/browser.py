@@ -15,17 +15,11 @@ import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 PATIENCE_S = 60.0
+SAID = ("Runtime.exceptionThrown", "Log.entryAdded", "Runtime.consoleAPICalled", "Page.javascriptDialogOpening")
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
     "--hide-scrollbars", "--disable-dev-shm-usage", "--remote-debugging-pipe", "--enable-unsafe-swiftshader",
 )  # fmt: skip
-
-
-def chromium() -> str:
-    found = next((path for name in NAMES if (path := shutil.which(name))), None)
-    if found is None:
-        pytest.skip("no chromium on this machine (apt-get install chromium)")
-    return found
 
 
 class Page:
@@ -54,12 +48,7 @@ class Page:
         params = event.get("params", {})
         if event.get("method") == "Network.requestWillBeSent":
             self.requests.append(params["request"]["url"])
-        if event.get("method") in (
-            "Runtime.exceptionThrown",
-            "Log.entryAdded",
-            "Runtime.consoleAPICalled",
-            "Page.javascriptDialogOpening",
-        ):
+        if event.get("method") in SAID:
             self.said.append(json.dumps(params)[:500])
 
     def _next(self) -> dict:
@@ -113,6 +102,9 @@ class Page:
 
 @contextlib.contextmanager
 def browser(folder: Path) -> Iterator[Page]:
+    chromium = next((path for name in NAMES if (path := shutil.which(name))), None)
+    if chromium is None:
+        pytest.skip("no chromium on this machine (apt-get install chromium)")
     (ours_in, theirs_out), (theirs_in, ours_out) = os.pipe(), os.pipe()
 
     def connect() -> None:  # the protocol's pipes are 3 and 4
@@ -120,7 +112,7 @@ def browser(folder: Path) -> Iterator[Page]:
         os.dup2(os.dup(spare[0]), 3)
         os.dup2(os.dup(spare[1]), 4)
 
-    command = [chromium(), *FLAGS, f"--user-data-dir={folder}", "about:blank"]
+    command = [chromium, *FLAGS, f"--user-data-dir={folder}", "about:blank"]
     with open(folder.with_name("chromium.log"), "wb") as log:
         process = subprocess.Popen(command, preexec_fn=connect, close_fds=False, stdout=log, stderr=log)
     os.close(theirs_in)

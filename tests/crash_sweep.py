@@ -201,9 +201,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], object]]] = {
     "distill train": ["distill train {set} --student {students}/student --out {out} {training}"],
     "distill infer": ["distill infer {set} --model {students}/student --out {out} {small}"],
     "distill merge": ["distill merge --model {students}/student --adapter {trained}/adapter --out {out}"],
-    "distill evaluate": [
-        "distill evaluate --dataset {students}/set --predictions {inferred}/predictions.jsonl --out {out}"
-    ],
+    "distill evaluate": ["distill evaluate --dataset {students}/set --predictions {inferred} --out {out}"],
     "run": ["run quickstart --out {out} {tiny}"],
     "run, towns": ["run quickstart --out {out} {tiny} {towns}"],
     "run, towns, release": [  # the release alone is left to do
@@ -235,17 +233,16 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="COMMAND")
     parser.add_argument("--few", action="store_true")
     parser.add_argument("--twice", action="store_true")
-    asked = parser.parse_args()
+    options = vars(parser.parse_args())
+    names = options.pop("names") or COMMANDS
     load_all()
     is_right = True
     with tempfile.TemporaryDirectory() as root, ExitStack() as stack:
         place = Place(Path(root), stack)
-        for name in asked.names or COMMANDS:
+        for name in names:
             begin_s = time.monotonic()
             try:
-                swept = sweep(
-                    works(name, place), place.root, few=asked.few, twice=asked.twice, only=OWN.get(name, ".*")
-                )
+                swept = sweep(works(name, place), place.root, only=OWN.get(name, ".*"), **options)
             except AssertionError as error:
                 print(f"{name}: does not run undisturbed: {error}", flush=True)
                 is_right = False

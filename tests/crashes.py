@@ -299,9 +299,8 @@ def sweep(
         if twice:
             swept.num_killed += run(works[-1], out, rng.choice(moments(steps))).code == -signal.SIGKILL
         again = run(works[-1], out)
-        found += (
-            differences(contents(out), expected) if again.code == 0 else [f"exit {again.code}: {again.said[-800:]}"]
-        )
+        failed = [f"exit {again.code}: {again.said[-800:]}"] if again.code else []
+        found += failed or differences(contents(out), expected)
         swept.wrong += [f"killed at {event} {path} ({place}), time {number}: {words}" for words in found]
     return swept
 

@@ -23,10 +23,8 @@ from cosfly.formats.frames import (
     TargetMeta,
     camera_meta,
     depth_bytes,
-    depth_file,
     frame_name,
     instance_bytes,
-    read_depth,
     rgb_bytes,
 )
 from cosfly.formats.kinds import KINDS
@@ -62,7 +60,6 @@ def make_playback_tree(
     root: Path,
     num_flights: int = 2,
     num_points: int = 24,
-    seed: int = 0,
     *,
     width_px: int = 64,
     height_px: int = 36,
@@ -75,7 +72,7 @@ def make_playback_tree(
         town = towns[index % len(towns)]
         for variant in ("ORI", "aug_001") if with_augmented else ("ORI",):
             flight, scene = make_flight(
-                num_points, seed=seed + index, town=town, trajectory=f"trajectory_{FIRST_SECOND + 1000 * index}",
+                num_points, seed=index, town=town, trajectory=f"trajectory_{FIRST_SECOND + 1000 * index}",
                 variant=variant, width_px=width_px, height_px=height_px,
             )  # fmt: skip
             folder = root / town / flight.trajectory / variant
@@ -244,13 +241,6 @@ def change_json(path: Path, change: Callable[[Any], object]) -> None:
     path.write_text(json.dumps(value))
 
 
-def pack_depth(folder: Path) -> None:
-    for path in folder.rglob("depth.npy"):
-        name, data = depth_file(read_depth(path.parent), "png")
-        path.with_name(name).write_bytes(data)
-        path.unlink()
-
-
 def _write_frame(folder: Path, flight: Track, scene: Scene, i: int) -> None:
     rgb, depth, semantic, instance = paint(scene, flight, i)
     folder.mkdir(parents=True, exist_ok=True)
@@ -284,13 +274,8 @@ def _chunk(name: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
 
 
-def png_around(
-    packed: bytes, width: int, height: int, kind: int = 2, interlace: int = 0, piece: int = 1 << 20
-) -> bytes:
-    """Return a PNG file around any bytes, whatever its header says of them; checksums are right.
-
-    kind: the colour type; piece: bytes of a chunk of pixels.
-    """
-    parts = [_chunk(b"IDAT", packed[k : k + piece]) for k in range(0, len(packed), piece)]
-    head = _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, kind, 0, 0, interlace))
-    return b"\x89PNG\r\n\x1a\n" + head + b"".join(parts) + _chunk(b"IEND", b"")
+def png_around(packed: bytes, width: int, height: int) -> bytes:
+    """Return a PNG file around any bytes, whatever its header says of them; checksums are right."""
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = (_chunk(b"IHDR", head), _chunk(b"IDAT", packed), _chunk(b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)

@@ -99,11 +99,10 @@ def make_adapter(base: Path, folder: Path, **changes) -> Path:
 
     student = load_student(base, device="cpu")
     lora = {"r": 4, "lora_alpha": 12, "init_lora_weights": False, "task_type": "CAUSAL_LM"}
+    lora |= {"target_modules": target_modules(student)} | changes
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(7)
-        student.model = get_peft_model(
-            student.model, LoraConfig(**{"target_modules": target_modules(student), **lora, **changes})
-        )
+        student.model = get_peft_model(student.model, LoraConfig(**lora))
     with torch.no_grad():  # what training changes is small beside what was there
         for name, tensor in student.model.named_parameters():
             if "lora_B" in name:

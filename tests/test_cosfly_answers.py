@@ -43,7 +43,7 @@ CHINESE = {
     "reasoning_trace": "行人保持在画面中央，因此无需改变动作。",
     "flight_decision": "track_straight",
 }
-TEXT, PRETTY, ZH = json.dumps(GOOD), json.dumps(GOOD, indent=2), json.dumps(CHINESE, ensure_ascii=False)
+TEXT, ZH = json.dumps(GOOD), json.dumps(CHINESE, ensure_ascii=False)
 DRAFT = json.dumps(GOOD | {"flight_decision": "hover"})
 HALF = TEXT[:60]
 
@@ -107,8 +107,6 @@ BODIES: list[tuple[str, bytes, str | tuple[str]]] = [
     ("proxies: events without a delta", b'data: {"choices": [{"delta": ["x"]}]}\n\ndata: [DONE]\n', ("no text",)),
     ("vLLM: NaN among the logprobs", completion({"content": TEXT}, logprobs=[float("nan")]), ("not JSON",)),
     ("nobody yet: nested 100,000 deep", b"[" * 100_000, ("not JSON",)),
-    ("nobody yet: an integer of 5,000 digits", b'{"choices": [' + b"9" * 5000 + b"]}", ("not JSON",)),
-    ("nobody yet: an object of infinity", assistant(content={"a": "Q"}).replace(b'"Q"', b"1e999"), ("no text",)),
 ]  # fmt: skip
 
 
@@ -139,18 +137,17 @@ def test_names_that_no_record_can_hold_are_left_out():
         assert read_models(Response(200, json.dumps({"data": [{"id": name}, {"id": "m"}]}).encode())) == {"m": None}
 
 
-JSON = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers()
-    | st.floats(allow_nan=False, allow_infinity=False)
-    | st.text(st.characters(codec=None)),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
-)
+def json_values(integers, characters):
+    simple = integers | st.floats(allow_nan=False, allow_infinity=False) | st.text(characters)
+    return st.recursive(
+        st.none() | st.booleans() | simple,
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+        max_leaves=8,
+    )
 
 
 @settings(max_examples=40)
-@given(JSON)
+@given(json_values(st.integers(), st.characters(codec=None)))
 def test_whatever_json_a_server_sends_can_be_written(value):
     read = read_body(json.dumps(value).encode())
     assert json.loads(json.dumps(read, ensure_ascii=False).encode()) == read
@@ -167,12 +164,10 @@ THINK, FENCE, PROSE = "thinking_tags", "code_fence", "prose_around"
 TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     # whole and clean
     ("any model with a schema", TEXT, ()),
-    ("llama.cpp: indented, after blanks", " \n\t" + PRETTY + "\n", ()),
     # thoughts
     ("Qwen3: a draft among the thoughts", f"<think>I would say {DRAFT} but no</think>{TEXT}", (THINK,)),
     ("DeepSeek R1, Qwen3-Thinking: the opener is in the prompt", f"So I would say {DRAFT}, hm.\n</think>\n\n{TEXT}",
         (THINK,)),
-    ("Kimi: nested thoughts", f"<think>a <think>b</think> c {DRAFT}</think>{TEXT}", (THINK,)),
     ("R1: speaks of the tag", f"<think>I must close with </think> in the end. {DRAFT}</think>{TEXT}", (THINK,)),
     ("any model: thoughts between two drafts", f"<think>a</think>{DRAFT}<think>no</think>{TEXT}", (THINK,)),
     ("DeepSeek: thoughts after the answer", f"{TEXT}\n<think>that should do</think>", "only_thinking"),
@@ -191,7 +186,7 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("gpt-oss: calls a function in the commentary",
         f"<|channel|>commentary to=functions.answer <|constrain|>json<|message|>{TEXT}<|call|>", "only_thinking"),
     # fences, prose, drafts
-    ("most models without a schema: a fence", f"```json\n{PRETTY}\n```", (FENCE,)),
+    ("most models without a schema: a fence", f"```json\n{json.dumps(GOOD, indent=2)}\n```", (FENCE,)),
     ("any model: a fence in a fence", f"````markdown\n```json\n{TEXT}\n```\n````", (FENCE, PROSE)),
     ("any model: a fence in the text of a field",
         changed(reasoning_trace="As ```json {}``` shows, nothing has to change."),
@@ -209,7 +204,6 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     # as models write JSON
     ("any model: curly quotes in a text", changed(reasoning_trace="The “person” keeps to the middle of the image."),
         "The “person” keeps to the middle of the image."),
-    ("any model: an escape that is none", TEXT.replace("person", "\\person"), "broken_json"),
     ("small models: a key twice", TEXT[:-1] + ', "flight_decision": "hover"}', "duplicate_key"),
     ("small models: a key twice in a draft", f'{DRAFT[:-1]}, "flight_decision": "ascend"}}\n{TEXT}', (PROSE,)),
     ("vLLM 0.26, a random model: raw control characters", TEXT.replace("walks", "wal\x0fks"), ("control_characters",)),
@@ -217,7 +211,6 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     # broken
     ("any server", "", "empty"),
     ("any model refuses", "I'm sorry, but I can't help with that.", "no_json_object"),
-    ("any model: a list", '["hover"]', "no_json_object"),
     ("any model: a draft, then cut off", f"{DRAFT}\nNo: {HALF}", "broken_json"),
     ("any model: quotes in a text", TEXT.replace("person", 'person "in red"'), "broken_json"),
     ("numpy habits: NaN", TEXT[:-1] + ', "claims": [NaN]}', "not_finite"),
@@ -248,7 +241,6 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
 CHINESE_TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("any model", ZH, ()),
     ("Qwen: Chinese prose round it", f"好的，以下是翻译结果：\n```json\n{ZH}\n```\n希望对您有帮助！", (FENCE, PROSE)),
-    ("any model: English for Chinese", TEXT, "critical_components_wrong_language"),
     ("small models: one field left in English", json.dumps(CHINESE | {"reasoning_trace": GOOD["reasoning_trace"]}),
         "reasoning_trace_wrong_language"),
     ("slots: names of facts are no English",
@@ -277,7 +269,8 @@ DECISIONS: list[tuple[str, str | None]] = [
     ("trackStraight", "track_straight"), ('"track straight"', "track_straight"), ("`track_straight`", "track_straight"),
     ("**track_straight**", "track_straight"), ("track_straight...", "track_straight"),
     ("track_straight()", None), ("Decision: hover", None), ("4. hover", None), ("", None), ("hover?", None),
-    ("hover or ascend", None), ("悬停", None), ("hov" * 50, None), ("-hover-", None), ("hover\ud83d", None),
+    ("hover or ascend", None), ("hover quickly", None), ("悬停", None), ("hov" * 50, None), ("-hover-", None),
+    ("hover\ud83d", None),
 ]  # fmt: skip
 
 
@@ -312,12 +305,7 @@ WRITERS = [
     lambda value: json.dumps({"name": "answer", "arguments": value}),
     lambda value: json.dumps({"response": json.dumps(value)}),
 ]
-NUMBERS = st.integers(-(10**17), 10**17) | st.floats(allow_nan=False, allow_infinity=False)
-VALUES = st.recursive(
-    st.none() | st.booleans() | NUMBERS | st.text(st.characters(codec="utf-8", exclude_characters="\ufffd")),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
-    max_leaves=8,
-)  # fmt: skip
+VALUES = json_values(st.integers(-(10**17), 10**17), st.characters(codec="utf-8", exclude_characters="\ufffd"))
 
 
 @given(VALUES, VALUES, st.sampled_from(BEFORE), st.sampled_from(AFTER), st.sampled_from(WRITERS))
@@ -336,12 +324,6 @@ def test_no_text_takes_long(text):
     start_s = time.process_time()
     find_object(text, GOOD)
     assert time.process_time() - start_s < 8.0  # they take below 2 s; a quadratic one took 40
-
-
-@given(st.text(max_size=30))
-def test_nothing_else_is_an_action(text):
-    assert normalize_action(text) in (None, *TOKENS)
-    assert normalize_action(text + " quickly") is None
 
 
 def test_what_the_reasoning_leads_to_stands_before_the_decision():
@@ -379,9 +361,7 @@ def test_captions_round_trip_and_errors_name_the_line(tmp_path):
         list(read_captions(tmp_path / "nowhere.jsonl"))
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("depth_range_m", float("nan")), ("depth_range_m", float("inf")), ("picture_px", (2**64, 36))]
-)
+@pytest.mark.parametrize(("name", "value"), [("depth_range_m", float("nan")), ("picture_px", (2**64, 36))])
 def test_no_caption_holds_what_is_no_number(name, value):
     with pytest.raises(ValidationError, match=name):
         make_caption("Town01", "trajectory_1", "ORI", 4, **{name: value})
@@ -407,10 +387,8 @@ def test_a_refusal_is_read_as_what_it_means():
 
 
 def test_a_request_that_is_sent_back_does_not_name_its_own_fault():
-    echoed = json.dumps(
-        {"detail": "Bad Request", "input": "x" * MOST_CHARACTERS + "maximum context length, json_schema"}
-    )
-    assert kind_of(400, echoed) == "unknown"
+    sent = "x" * MOST_CHARACTERS + "maximum context length, json_schema"
+    assert kind_of(400, json.dumps({"detail": "Bad Request", "input": sent})) == "unknown"
 
 
 def test_a_server_that_is_away_may_come_back_and_a_request_that_is_refused_stays_refused():

@@ -262,17 +262,6 @@ def test_visibility_agrees_with_slow_rays():
     np.testing.assert_allclose(kernels.visibility(index, drones, targets), expected)
 
 
-def curve(num: int) -> DroneTrace:
-    """A flight on a curve, whose heading passes the south."""
-    time_s = np.arange(num) * 0.1
-    positions = np.stack([40 * np.cos(time_s / 4), 40 * np.sin(time_s / 4), 12 + time_s], axis=1)
-    yaw_deg = (time_s * 35.0 + 120.0 + 180.0) % 360.0 - 180.0
-    rotations = np.stack([-30 - time_s, yaw_deg, np.zeros(num)], axis=1)
-    targets = np.stack([np.zeros(num), time_s, np.full(num, 0.9)], axis=1)
-    ones = np.ones(num)
-    return DroneTrace("p", "none", time_s, positions, rotations, targets, ones, ones)
-
-
 def motion_of(time_s, poses) -> PlannedMotion:
     poses = np.asarray(poses, dtype=np.float64)
     return PlannedMotion(np.asarray(time_s), poses, poses[:, 4], poses[:, :3])
@@ -287,7 +276,11 @@ def test_the_known_answer_of_the_public_release_as_an_action():
 
 
 def test_flying_the_actions_gives_the_plan():
-    shown = curve(31).every(5)
+    """On a curve, with a heading that passes the south."""
+    time_s, zeros = np.arange(31) * 0.1, np.zeros(31)
+    positions = np.stack([40 * np.cos(time_s / 4), 40 * np.sin(time_s / 4), 12 + time_s], axis=1)
+    rotations = np.stack([-30 - time_s, (time_s * 35.0 + 300.0) % 360.0 - 180.0, zeros], axis=1)
+    shown = DroneTrace("p", "none", time_s, positions, rotations, 0 * positions, zeros, zeros).every(5)
     motion = motion_of(shown.time_s, np.hstack([shown.positions_m, shown.rotations_deg]))
     yaw = np.radians(np.stack([np.zeros(7), motion.yaw_deg, np.zeros(7)], axis=1))
     flown = motion.action[:-1, :3] * 0.5
@@ -301,10 +294,6 @@ def test_flying_the_actions_gives_the_plan():
 def walk(num_points: int, *, begin: tuple[float, float] = (0.0, 0.0)):
     time_s = np.arange(num_points) * 0.5
     return time_s, np.column_stack([begin[0] + 1.4 * time_s, np.full(num_points, begin[1]), np.full(num_points, 0.9)])
-
-
-def course(name: str, points) -> Course:
-    return Course(name, "Town01", *points)
 
 
 def groups(*courses: Course) -> list[set[str]]:
@@ -335,14 +324,14 @@ def test_perturbed_twins_are_one_walk_once_they_are_read_again(tmp_path):
 def test_near_for_half_of_the_time_and_five_seconds_or_all_the_time_is_one_walk(num_s, near_s, beside_m, is_one):
     time_s, places_m = walk(2 * num_s)
     beside = np.where(time_s < near_s, beside_m, 9.0)[:, None] * [0.0, 1.0, 0.0]
-    assert (len(groups(course("a", (time_s, places_m)), course("b", (time_s, places_m + beside)))) == 1) == is_one
+    one, other = (Course(name, "Town01", time_s, at_m) for name, at_m in (("a", places_m), ("b", places_m + beside)))
+    assert (len(groups(one, other)) == 1) == is_one
 
 
 def test_walks_go_from_neighbour_to_neighbour_and_have_the_first_name():
-    beside_each_other = [course(name, walk(9 + k, begin=(0.0, 0.4 * k))) for k, name in enumerate("cab")]
-    assert walks_of([*beside_each_other, course("d", walk(9, begin=(0.0, 1.4)))]) == dict.fromkeys("abc", "a") | {
-        "d": "d"
-    }
+    y_m = {"c": 0.0, "a": 0.4, "b": 0.8, "d": 1.4}
+    courses = [Course(name, "Town01", *walk(9 + k, begin=(0.0, at_m))) for k, (name, at_m) in enumerate(y_m.items())]
+    assert walks_of(courses) == {"a": "a", "b": "a", "c": "a", "d": "d"}
 
 
 @given(

@@ -110,8 +110,7 @@ def test_what_a_tree_was_never_to_have_is_not_missing(workplace):
     for folder in (lost, never):
         for path in [*folder.rglob("depth.npy"), *folder.rglob("instance.png")]:
             path.unlink()
-    names = [p.relative_to(never).as_posix() for p in never.rglob("*") if p.is_file() and p.name != CHECKSUMS]
-    write_checksums(never, {name: sha256_file(never / name) for name in names})
+    list_files(never)
     found = inspect(workplace)
     assert codes_of(found, lost)["missing_file"] == "error"
     assert codes_of(found, never) == {"not_in_this_tree": "note"}
@@ -198,11 +197,15 @@ def test_what_hides_or_holds_the_person_is_found(workplace):
 
 def edit_image(path: Path, change) -> None:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    cv2.imwrite(str(path), change(image))
+    cv2.imwrite(str(path), change(image).astype(np.uint8))
 
 
-def edit_depth(path: Path, change) -> None:
-    np.save(path, change(np.load(path)))
+def instances(change):
+    return lambda f: edit_image(f / FRAME / "instance.png", change)
+
+
+def depths(change):
+    return lambda f: np.save(f / FRAME / "depth.npy", change(np.load(f / FRAME / "depth.npy")).astype("f4"))
 
 
 def flip_byte(path: Path, position: int) -> None:
@@ -211,23 +214,18 @@ def flip_byte(path: Path, position: int) -> None:
     path.write_bytes(data)
 
 
-def edit(folder: Path, change) -> None:
-    change_json(folder / "trajectory.json", change)
+def told(change):
+    return lambda f: change_json(f / "trajectory.json", change)
 
 
 def at_point(key, name, value):
-    return lambda trajectory: trajectory["points"][3][key].update({name: value})
+    return told(lambda trajectory: trajectory["points"][3][key].update({name: value}))
 
 
 def record_masks(folder: Path, wrong: dict[int, list[float] | None]) -> None:
     boxes = [mask_box(read_instance(folder / frame_name(i))[0] == 12) for i in range(NUM_POINTS)]
-    told = {i: None if np.isnan(box).any() else box.tolist() for i, box in enumerate(boxes)} | wrong
-
-    def change(trajectory):
-        for i, box in told.items():
-            trajectory["points"][i]["target"]["mask_bbox_2d"] = box
-
-    edit(folder, change)
+    named = {i: None if np.isnan(box).any() else box.tolist() for i, box in enumerate(boxes)} | wrong
+    told(lambda t: [t["points"][i]["target"].update(mask_bbox_2d=box) for i, box in named.items()])(folder)
 
 
 FRAME = frame_name(3)
@@ -238,40 +236,33 @@ DEFECTS = {
     "broken_image": lambda f: flip_byte(f / FRAME / "rgb.png", 200),
     "broken_annotation": lambda f: (f / FRAME / "meta.json").write_text("{"),
     "checksum": lambda f: flip_byte(f / FRAME / "meta.json", 30),
-    "depth_range": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: np.where(d > 14, np.nan, d).astype("f4")),
-    "depth_range above": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: d + np.float32(1000)),
-    "depth_disagrees": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: (d + np.float32(5)) % 1000),
+    "depth_range": depths(lambda d: np.where(d > 14, np.nan, d)),
+    "depth_range above": depths(lambda d: d + 1000),
+    "depth_disagrees": depths(lambda d: (d + 5) % 1000),
     "mask_disagrees small": lambda f: record_masks(f, {3: [1.0, 1.0, 3.0, 3.0]}),
     "mask_disagrees large": lambda f: record_masks(f, {3: [0.0, 0.0, 192.0, 108.0]}),
     "mask_disagrees null": lambda f: record_masks(f, {3: None}),
-    "mask_disagrees": lambda f: edit_image(
-        f / FRAME / "instance.png", lambda image: np.where(image[..., 2:] == KINDS["Pedestrians"], 0, image)
-    ),
+    "mask_disagrees": instances(lambda image: np.where(image[..., 2:] == KINDS["Pedestrians"], 0, image)),
     "blank_frame": lambda f: edit_image(f / FRAME / "rgb.png", lambda image: image * 0 + 90),
     "frozen_frame": lambda f: shutil.copy(f / frame_name(2) / "rgb.png", f / FRAME / "rgb.png"),
-    "pose_differs": lambda f: edit(f, at_point("drone_pose", "yaw", 12.0)),
-    "projection_differs": lambda f: edit(f, at_point("target", "image_uv", [1.0, 2.0])),
-    "target_missing": lambda f: edit(f, at_point("target", "world_location", None)),
-    "layout": lambda f: edit(f, lambda t: t.update(schema_version="6.0.0")),
-    "pose_differs in place": lambda f: edit(
-        f, lambda t: t["points"][3]["drone_pose"].update(z=t["points"][3]["drone_pose"]["z"] + 0.1)
+    "pose_differs": at_point("drone_pose", "yaw", 12.0),
+    "projection_differs": at_point("target", "image_uv", [1.0, 2.0]),
+    "target_missing": at_point("target", "world_location", None),
+    "layout": told(lambda t: t.update(schema_version="6.0.0")),
+    "pose_differs in place": told(
+        lambda t: t["points"][3]["drone_pose"].update(z=t["points"][3]["drone_pose"]["z"] + 0.1)
     ),
-    "pose_differs of the person": lambda f: edit(f, lambda t: t["points"][3]["target"]["world_location"].update(x=9.0)),
-    "projection_differs of the box": lambda f: edit(
-        f, at_point("target", "bbox_2d", {"xmin": 1, "ymin": 2, "xmax": 3, "ymax": 4})
-    ),
-    "projection_differs in depth": lambda f: edit(f, at_point("target", "depth", 1.0)),
-    "target_missing in the picture": lambda f: edit(f, at_point("target", "image_uv", None)),
-    "illegible": lambda f: edit(f, lambda t: [p["target"].update(legible=False) for p in t["points"]]),
-    "teleport": lambda f: edit(f, lambda t: t["points"][3]["drone_pose"].update(x=99.0)),
-    "missing_file that is listed": lambda f: (f / FRAME / "meta.json").unlink(),
+    "pose_differs of the person": told(lambda t: t["points"][3]["target"]["world_location"].update(x=9.0)),
+    "projection_differs of the box": at_point("target", "bbox_2d", {"xmin": 1, "ymin": 2, "xmax": 3, "ymax": 4}),
+    "projection_differs in depth": at_point("target", "depth", 1.0),
+    "target_missing in the picture": at_point("target", "image_uv", None),
+    "illegible": told(lambda t: [p["target"].update(legible=False) for p in t["points"]]),
+    "teleport": at_point("drone_pose", "x", 99.0),
     "broken_annotation of another frame": lambda f: change_json(f / FRAME / "meta.json", lambda m: m.update(index=4)),
-    "broken_image of instances": lambda f: edit_image(f / FRAME / "instance.png", lambda image: image[:54, :96]),
-    "broken_image in grey": lambda f: cv2.imwrite(
-        str(f / FRAME / "rgb.png"), np.arange(192 * 108, dtype=np.uint8).reshape(108, 192)
-    ),
+    "broken_image of instances": instances(lambda image: image[:54, :96]),
+    "broken_image in grey": lambda f: cv2.imwrite(str(f / FRAME / "rgb.png"), np.eye(108, 192, dtype=np.uint8)),
     "checksum of the list": lambda f: (f / "checksums.sha256").write_text("frame_00003"),
-    "depth_range everywhere": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: d * 0 + 7),
+    "depth_range everywhere": depths(lambda d: d * 0 + 7),
 }
 
 
@@ -288,7 +279,7 @@ def paint(folder: Path, color: tuple[int, int, int], *, grain: bool) -> None:
     def change(image: np.ndarray) -> np.ndarray:
         image[surface] = color
         noise = np.random.default_rng(0).integers(-6, 7, image.shape)
-        grainy = np.clip(image.astype(int) + noise, 0, 255).astype(np.uint8)
+        grainy = np.clip(image.astype(int) + noise, 0, 255)
         return grainy if grain else np.where(surface[..., None], image, grainy)
 
     edit_image(folder / FRAME / "rgb.png", change)
@@ -297,19 +288,14 @@ def paint(folder: Path, color: tuple[int, int, int], *, grain: bool) -> None:
 def let_fight(folder: Path) -> None:
     surface = largest_surface(folder)
     surface[:, ::2] = False
-
-    def change(image: np.ndarray) -> np.ndarray:
-        image[surface] = (1, 77, KINDS["Walls"])
-        return image
-
-    edit_image(folder / FRAME / "instance.png", change)
+    instances(lambda image: np.where(surface[..., None], (1, 77, KINDS["Walls"]), image))(folder)
 
 
-def at_upper_left(values: np.ndarray, metres: float) -> np.ndarray:
+def gone(depth: np.ndarray) -> np.ndarray:
     """Depth with a part that lies farther off: what stood there is gone."""
-    part = values[: len(values) // 2, : values.shape[1] // 2]
-    part[part < 900] += np.float32(metres)
-    return values
+    part = depth[: len(depth) // 2, : depth.shape[1] // 2]
+    part[part < 900] += 60.0
+    return depth
 
 
 # What a person has to look at; where None stands, the finding is of the whole flight.
@@ -317,20 +303,14 @@ TO_REVIEW = {
     "missing_texture of one colour": lambda f: paint(f, (120, 125, 130), grain=False),
     "missing_texture magenta": lambda f: paint(f, (240, 20, 240), grain=True),
     "z_fighting": let_fight,
-    "temporal_jump gone": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: at_upper_left(d, 60.0)),
-    "temporal_jump near": lambda f: edit_depth(
-        f / FRAME / "depth.npy", lambda d: np.where(d < 900, 0.8 * d, d).astype("f4")
-    ),
-    "invalid_depth": lambda f: edit_depth(
-        f / FRAME / "depth.npy", lambda d: np.where(np.arange(len(d))[:, None] < 5, 0, d).astype("f4")
-    ),
-    "shorter_than_planned": lambda f: edit(
-        f, lambda t: (t["points"].pop(), t["points"][-1]["nav_waypoint"].update(t1_world=None))
-    ),
-    "never_visible": lambda f: edit(f, lambda t: [p["target"].update(visible=False) for p in t["points"]]),
+    "temporal_jump gone": depths(gone),
+    "temporal_jump near": depths(lambda d: np.where(d < 900, 0.8 * d, d)),
+    "invalid_depth": depths(lambda d: np.where(np.arange(len(d))[:, None] < 5, 0, d)),
+    "shorter_than_planned": told(lambda t: (t["points"].pop(), t["points"][-1]["nav_waypoint"].update(t1_world=None))),
+    "never_visible": told(lambda t: [p["target"].update(visible=False) for p in t["points"]]),
     "track_quality": lambda f: [edit_image(f / frame_name(i) / "instance.png", slimmer) for i in range(NUM_POINTS)],
     "stray_frame": lambda f: shutil.copytree(f / frame_name(0), f / frame_name(99)),
-    "no_trace": lambda f: edit(f, lambda t: t["source"].update(scenario_id="another")),
+    "no_trace": told(lambda t: t["source"].update(scenario_id="another")),
 }
 
 
@@ -351,7 +331,7 @@ def test_far_is_far(workplace, form):
     path.unlink()
     (folder / FRAME / name).write_bytes(data)
     sky = (0, 0, KINDS["Sky"])
-    edit_image(folder / FRAME / "instance.png", lambda image: np.where(top_row[..., None], sky, image).astype(np.uint8))
+    instances(lambda image: np.where(top_row[..., None], sky, image))(folder)
     assert codes_of(inspect(workplace, NO_SUMS), folder) == {}
     assert read_depth(folder / FRAME).max() == 1000.0
 
@@ -362,7 +342,7 @@ def plant(specimen: Path, root: Path, defects: dict) -> None:
     for number, defect in enumerate(["", *defects]):
         trajectory = shutil.copytree(pair, root / f"tree/Town01/trajectory_{1_776_000_000 + number}")
         for folder in trajectory.iterdir():
-            edit(folder, lambda t, name=str(number): t["source"].update(scenario_id=name))
+            told(lambda t, name=str(number): t["source"].update(scenario_id=name))(folder)
         plans.append(replace(plan, path_id=str(number)))
         list_files(trajectory)
         if defect:
@@ -426,7 +406,7 @@ def test_others_keep_clear_of_drone_and_person(workplace, beside, shift_m, codes
 
 def test_an_unreadable_flight_is_a_counted_failure_while_others_go_on(workplace):
     broken, twin = first_flight(workplace), first_flight(workplace, "aug_001")
-    edit(broken, at_point("drone_pose", "x", "oops"))
+    at_point("drone_pose", "x", "oops")(broken)
     found = inspect(workplace)
     assert codes_of(found, twin) == {}
     flight = next(f for f in found.flights if f.folder.endswith(f"{broken.parent.name}/ORI"))
@@ -440,11 +420,8 @@ def test_an_unreadable_flight_is_a_counted_failure_while_others_go_on(workplace)
 
 def test_the_funnel_counts_prefiltered_and_unrendered_plans(workplace):
     plans = [plan_of(f) for f in find_tracks(workplace / "tree") if f.name == "ORI"]
-    extra = [
-        replace(plans[0], path_id="low", drop_reason="five_ray_visibility"),
-        replace(plans[0], path_id="rough", drop_reason="smoothness"),
-        replace(plans[0], path_id="lost"),
-    ]
+    reasons = {"low": "five_ray_visibility", "rough": "smoothness", "lost": None}
+    extra = [replace(plans[0], path_id=name, drop_reason=reason) for name, reason in reasons.items()]
     write_traces(workplace / "drone_trace.json", plans + extra, {})
     funnel = inspect(workplace).funnel.trajectories
     assert (funnel.planned, funnel.rendered, funnel.not_rendered) == (5, 2, 1)

@@ -60,8 +60,6 @@ def test_instance_ids_are_the_boxes_own_where_they_fit_and_leave_those_of_others
     boxes = numbered([5, MAX_BOX_ID, 1])
     assert (instance_ids(boxes).tolist(), has_own_ids(boxes)) == ([5, MAX_BOX_ID, 1], True)
     assert instance_ids(numbered([0, 1])).tolist() == [1, 2]
-    assert not has_own_ids(boxes, num_others=1)
-    assert instance_ids(boxes, num_others=1).tolist() == [1, 2, 3]
     ids = instance_ids(numbered(np.arange(MAX_BOX_ID + 5) + 1), num_others=20)
     others = [other_id(number) for number in range(20)]
     assert np.isin(ids, [*others, PERSON_ID, 0]).sum() == 0
@@ -175,9 +173,8 @@ def test_smooth_perturbations_keep_probabilities_and_move_as_a_drone_and_a_walke
     drawn = np.array([[state["position"] != "none", state["rotation"] != "none"] for state in after.states])
     np.testing.assert_allclose(drawn.mean(axis=0), [0.6, 0.6], atol=0.1)
     order = None if sampling == "spherical" else np.inf
-    for offsets_m, radius_m in (
-        (after.drone_offsets_m, cfg.drone_radius_m), (after.target_offsets_m[:, :2], cfg.pedestrian_radius_m)
-    ):  # fmt: skip
+    walked_m = after.target_offsets_m[:, :2]
+    for offsets_m, radius_m in ((after.drone_offsets_m, cfg.drone_radius_m), (walked_m, cfg.pedestrian_radius_m)):
         assert 0.8 * radius_m < np.linalg.norm(offsets_m, ord=order, axis=1).max() <= radius_m + 1e-9
         steps = np.diff(offsets_m, axis=0)
         speeds_mps = np.linalg.norm(steps, axis=1) / dt_s
@@ -271,9 +268,8 @@ def test_the_tree_is_complete_and_readable_and_shows_what_its_annotation_says(tm
             assert meta.target.num_pixels == int((ids == PERSON_ID).sum()) > 0
             assert meta.target.visible == bool(flight.target.visible[i])
             assert meta.target.visibility == pytest.approx(flight.target.visibility[i], abs=1e-6)
-            assert (
-                meta.target.mask_bbox_2d == flight.target.mask_bbox[i].tolist() == mask_box(ids == PERSON_ID).tolist()
-            )
+            box = mask_box(ids == PERSON_ID).tolist()
+            assert meta.target.mask_bbox_2d == flight.target.mask_bbox[i].tolist() == box
             tree_y = json.loads((frame / "meta.json").read_text())["drone_pose"]["y"]
             told_y = pytest.approx(-flight.positions_m[i, 1])
             assert tree_y == -meta.drone_pose[1] == told_y, "the tree's axes are CARLA's"
@@ -374,21 +370,18 @@ def test_what_a_wall_hides_is_not_said(y_m, says_legs):
 @pytest.fixture(scope="session")
 def crowded_tree(built_once):
     """Two walks, both tracks, each among eight bystanders of whom four look alike the target but for one thing."""
-    return built_once("crowd", make_crowded_tree) / "out"
 
+    def make(folder):
+        traces = [circling(3, f"path_{k:03d}") for k in range(2)]
+        places_m = [[x, y, -0.9] for x in (-4.0, -1.5, 1.0, 3.5) for y in (-2.0, 2.0)]
+        crowds = [[Bystander(t.targets_m + place_m, np.zeros(3)) for place_m in places_m] for t in traces]
+        alike = [[replace(one, is_look_alike=k < 4) for k, one in enumerate(crowd)] for crowd in crowds]
+        others = [Bystanders(t.path_id, crowd) for t, crowd in zip(traces, alike, strict=True)]
+        write_bystanders(folder / "others.json", others, {})
+        cfg = build(RenderConfig, {"width_px": 320, "height_px": 180, "fovs_deg": [60.0]}, "test")
+        run(cfg, *write_inputs(folder / "in", traces), folder / "out", seed=2, others=folder / "others.json")
 
-def make_crowded_tree(folder):
-    traces = [circling(3, f"path_{k:03d}") for k in range(2)]
-    places_m = [[x, y, -0.9] for x in (-4.0, -1.5, 1.0, 3.5) for y in (-2.0, 2.0)]
-    crowd = [
-        Bystander(trace.targets_m + place_m, np.zeros(3), k < 4)
-        for trace in traces for k, place_m in enumerate(places_m)
-    ]  # fmt: skip
-    write_bystanders(
-        folder / "others.json", [Bystanders(t.path_id, crowd[i * 8 :][:8]) for i, t in enumerate(traces)], {}
-    )
-    cfg = build(RenderConfig, {"width_px": 320, "height_px": 180, "fovs_deg": [60.0]}, "test")
-    run(cfg, *write_inputs(folder / "in", traces), folder / "out", seed=2, others=folder / "others.json")
+    return built_once("crowd", make) / "out"
 
 
 def test_a_town_that_is_a_path_is_refused():

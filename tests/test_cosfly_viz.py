@@ -143,9 +143,7 @@ def test_of_many_tracks_whole_trajectories_are_shown(run_folder, tmp_path):
 
 @pytest.fixture(scope="module")
 def tab(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("chromium") / "profile"
-    folder.mkdir()
-    with browser(folder) as opened:
+    with browser(tmp_path_factory.mktemp("chromium") / "profile") as opened:
         yield opened
 
 
@@ -340,8 +338,7 @@ def click_at(page: Page, *places: list[float]) -> None:
 
 
 def pixel_of(page: Page, place: list[float]) -> tuple[float, float]:
-    x, y = page.run(f"window.editor.map.at({json.dumps(place)})")
-    return x, y  # the board begins at the window's corner
+    return tuple(page.run(f"window.editor.map.at({json.dumps(place)})"))  # the board begins at the window's corner
 
 
 def settled(page: Page) -> None:

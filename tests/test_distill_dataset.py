@@ -210,10 +210,6 @@ def windows_of_tracks(four_walks, tmp_path_factory) -> Path:
     return dual_track.run(DualTrackConfig(val_fraction=0.25, test_fraction=0.25), [four_walks], out)
 
 
-def samples(windows_of_tracks: Path) -> dict[str, list[TrackSample]]:
-    return {split: [TrackSample(**row) for row in rows_of(split_path(windows_of_tracks, split))] for split in SPLITS}
-
-
 def test_the_papers_windows():
     """Windows of 10 frames, one every 3: (N - 10) / 3 + 1, which the paper calls 50 to 60 of 170 to 200 frames."""
     for num_frames, expected in [(9, []), (10, [0]), (12, [0]), (13, [0, 3]), (170, 54), (200, 64)]:
@@ -221,8 +217,15 @@ def test_the_papers_windows():
         assert (len(found) if isinstance(expected, int) else found) == expected
 
 
-def test_a_window_holds_both_tracks_frame_by_frame(four_walks, windows_of_tracks):
-    found = [sample for split in samples(windows_of_tracks).values() for sample in split]
+def test_a_window_holds_both_tracks_frame_by_frame_and_no_walk_is_in_two_splits(four_walks, windows_of_tracks):
+    paths = {split: split_path(windows_of_tracks, split) for split in SPLITS}
+    splits = {split: [TrackSample(**row) for row in rows_of(path)] for split, path in paths.items()}
+    walks = [{sample.walk for sample in found} for found in splits.values()]
+    assert all(walks)
+    assert sum(map(len, walks)) == len(set.union(*walks)) == 4
+    told = json.loads((windows_of_tracks / "manifest.json").read_text())["splits"]
+    assert {name: facts["samples"] for name, facts in told.items()} == {name: len(own) for name, own in splits.items()}
+    found = [sample for own in splits.values() for sample in own]
     assert len(found) == 4 * ((NUM_FRAMES - 10) // 3 + 1)
     for sample in found:
         folder = four_walks / sample.town / sample.trajectory
@@ -259,15 +262,6 @@ def test_a_bad_flight_stops_no_other(tmp_path, four_walks):
     assert counts.dropped == {"no_clean_flight": 1, "clean_flight_of_other_frames": 1}
     assert counts.failed.total() == 1
     assert flights[0].parent.name in read_failures(out / "failures.jsonl")[0].id
-
-
-def test_no_walk_is_in_two_splits(windows_of_tracks):
-    splits = samples(windows_of_tracks)
-    walks = [{sample.walk for sample in found} for found in splits.values()]
-    assert all(walks)
-    assert sum(map(len, walks)) == len(set.union(*walks)) == 4
-    told = json.loads((windows_of_tracks / "manifest.json").read_text())["splits"]
-    assert {name: facts["samples"] for name, facts in told.items()} == {name: len(own) for name, own in splits.items()}
 
 
 NUM_POINTS = 9

@@ -214,8 +214,7 @@ def test_a_rule_and_a_network_that_see_no_picture_beat_the_majority(samples):
 def place(tmp_path, samples) -> Path:
     """set/ in both languages, of three walks; predictions of the students `one` and `other`."""
     both = [*samples, *(sample_of(frame, "zh") for frame in FRAMES)]
-    known = {"contradicted": ("ascend",)}
-    both = [sample.model_copy(update={"walk": f"walk_{k % 3}", **known}) for k, sample in enumerate(both)]
+    both = [one.model_copy(update={"walk": f"walk_{k % 3}", "contradicted": ("ascend",)}) for k, one in enumerate(both)]
     write_set(tmp_path / "set", {"train": both, "val": both, "test": both})
     write_predictions(tmp_path / "one", predictions_of(both[:8]) + predictions_of(both[8:]))
     right = [make_prediction(sample, "test", sample.answer, 9, True) for sample in both]

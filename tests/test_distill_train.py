@@ -238,10 +238,8 @@ for pid, _ in in_order(lambda order: (os.getpid(), bytes(10_000_000)), range(200
 
 @pytest.mark.slow
 def test_workers_end_with_a_training_that_was_killed(tmp_path):
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    with subprocess.Popen(
-        [sys.executable, "-c", WORKERS], stdout=subprocess.PIPE, text=True, env=environment
-    ) as process:
+    given: dict = {"stdout": subprocess.PIPE, "text": True, "env": {**os.environ, "OMP_NUM_THREADS": "1"}}
+    with subprocess.Popen([sys.executable, "-c", WORKERS], **given) as process:
         assert process.stdout is not None
         workers = {int(process.stdout.readline()) for _ in range(12)}  # more than were computed before the first signal
         assert len(workers) == 2

@@ -29,14 +29,14 @@ from test_cosfly_answers import TEXT
 from test_cosfly_boxfile import PLAIN, collection, houses
 from test_cosfly_inspection import plan_of
 from test_cosfly_map_kinds import city, node, write_world
-from test_cosfly_viz import data_of
+from test_cosfly_viz import EVIL, data_of
 
 from caption.schema import CaptionConfig
 from caption.stage.ledger import REPORT_FORMAT, CaptionReport, page_html
 from caption.stage.stage import run as caption
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.captions import Caption, read_captions
-from cosfly.formats.frames import DEPTH_PNG, read_depth, read_instance, read_meta, read_rgb
+from cosfly.formats.frames import DEPTH_PNG, depth_file, read_depth, read_instance, read_meta, read_rgb
 from cosfly.formats.inspection import Inspection, read_inspection
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback_file import read_track
@@ -61,7 +61,7 @@ from cosfly.runtime.tables import rows_of
 from cosfly.viz.scene_page import run
 from release.card.render import render_card
 from release.record import ReleaseRecord, read_record
-from specimens import make_playback_tree, map_of, pack_depth
+from specimens import make_playback_tree, map_of
 
 INPUTS = 40  # for each reader
 LONGEST_LINE = 5_000
@@ -96,14 +96,14 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
 def specimens(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = make_inputs(tmp_path_factory.mktemp("specimens"))
     build(root, root / "release")
-    pack_depth(min(root.glob("tree/Town02/*/ORI")))
+    for path in min(root.glob("tree/Town02/*/ORI")).rglob("depth.npy"):
+        path.with_name(DEPTH_PNG).write_bytes(depth_file(read_depth(path.parent), "png")[1])
+        path.unlink()
     house, wall = ("Buildings", (0, 14, 8), (12, 5, 8)), ("Walls", (20, -9, 1), (4, 0.2, 1), 30.0)
     write_boxes(root / "boxes_3d.json", map_of(house, wall, name="street"))
-    for name, value in (
-        ("roi_polygon.json", {"points_world": [[0, 0], [9, 0], [9, 9]], "holes": [[[1, 1], [2, 1], [2, 2]]]}),
-        ("city.json", city()),
-    ):  # fmt: skip
-        write_json(root / name, value)
+    region = {"points_world": [[0, 0], [9, 0], [9, 9]], "holes": [[[1, 1], [2, 1], [2, 2]]]}
+    write_json(root / "roi_polygon.json", region)
+    write_json(root / "city.json", city())
     write_world(root, node("BP_Tree1_C", 100, 200))
     (root / "own.geojson").write_text(collection(*houses(yaw_deg=0)))
     (root / "own.csv").write_text(PLAIN)
@@ -320,9 +320,6 @@ def test_a_card_shows_forged_texts(specimens):
     assert not OBEYED.search(card.replace("\n", ""))
 
 
-EVIL = "</script><script>window.hacked=1</script><img src=x onerror='window.hacked=2'>"
-
-
 @pytest.fixture(scope="module")
 def place(tmp_path_factory) -> Path:
     """A map of three boxes with a hostile name, a tree of two walks, and what two planners flew over them."""
@@ -330,12 +327,9 @@ def place(tmp_path_factory) -> Path:
     tree = make_playback_tree(root / "tree", 2, 8, width_px=96, height_px=54)
     rows, halves = [[0, 0, -0.1], [6, 3, 5], [30, 4, 2]], [[60, 60, 0.1], [2, 3, 5], [1, 1, 2]]
     kinds = [KINDS[kind] for kind in ("Ground", "Buildings", "Vegetation")]
-    header = MapHeader(name=EVIL, ground_z_m=0.0)
-    write_boxes(
-        root / "map.json", make_box_map(rows, halves, [[0, 0, 0], [10, 40, 5], [0, 0, 0]], kinds, header=header)
-    )
-    flights = [read_track(folder) for folder in find_tracks(tree) if folder.name == "ORI"]
-    plans = [plan_of(flight.folder) for flight in flights]
+    turns, header = [[0, 0, 0], [10, 40, 5], [0, 0, 0]], MapHeader(name=EVIL, ground_z_m=0.0)
+    write_boxes(root / "map.json", make_box_map(rows, halves, turns, kinds, header=header))
+    plans = [plan_of(folder) for folder in find_tracks(tree) if folder.name == "ORI"]
     for name in ("muco", EVIL):
         own = [replace(plan, planner=name, metrics={"length_m": 12.5}) for plan in plans]
         write_traces(root / f"drone_trace_{len(name)}.json", own, {})
@@ -354,9 +348,8 @@ def test_what_is_packed_is_what_was_read(place, tmp_path):
     page = run(place / "map.json", tmp_path / "scene.html", traces=planners(place), data=place / "tree")
     data = data_of(page)
     rows = floats(data["boxes"], 12)
-    assert [(kind["name"], kind["first"], kind["count"]) for kind in data["kinds"]] == [
-        ("Ground", 0, 1), ("Buildings", 1, 1), ("Vegetation", 2, 1),
-    ]  # fmt: skip
+    kinds = [(kind["name"], kind["first"], kind["count"]) for kind in data["kinds"]]
+    assert kinds == [("Ground", 0, 1), ("Buildings", 1, 1), ("Vegetation", 2, 1)]
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     found = rows[2, :3] + signs @ rows[2, 3:].reshape(3, 3)
     assert np.allclose(found, box_corners(np.array([30, 4, 2]), np.array([1, 1, 2])), atol=1e-4)
