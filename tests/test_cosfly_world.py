@@ -330,4 +330,6 @@ def test_numbers_of_cars_are_not_used_and_words_say_what_they_change():
     assert trace["not_used"] == ["20 parked cars"]
     assert "narrow (streets)" in trace["used"]
     assert plan.parked_share == WorldPlan().parked_share
+    for words in ("no parked cars", "without any parked cars", "no cars"):
+        assert plan_by_rules(f"a town with {words}", 0)[0].parked_share == 0.0
     assert "parked cars (cars)" in plan_by_rules("a town with parked cars", 0)[1]["used"]

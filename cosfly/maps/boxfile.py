@@ -565,6 +565,8 @@ def _typed(row: _Row, cfg: BoxesConfig) -> tuple[str, str]:
     if not any(values.values()):
         properties = ", ".join(row.values)[:80] or "none"
         problem = f"maps.boxes.type_column names no property of this feature, which has {properties}"
+    elif row.values.get("highway") == "crossing":
+        problem = "the node is on a mapped crossing, is an unmarked crossing, or is on no street"
     else:
         tags = ", ".join(f"{column}={value[:MOST_NAME]!r}" for column, value in values.items())
         problem = f"there is no type for {tags}; maps.boxes.types can name one"

@@ -53,8 +53,13 @@ class Feature(NamedTuple):
         return str(self.tags.get("bridge") or "no") != "no"
 
     @property
+    def is_unmarked(self) -> bool:
+        """Whether it is a crossing without stripes."""
+        return self.tags.get("crossing") in ("no", "unmarked")
+
+    @property
     def is_crossing(self) -> bool:
-        if self.tags.get("crossing") in ("no", "unmarked"):
+        if self.is_unmarked:
             return False
         is_way = self.tags.get("footway") == "crossing" and self.is_line
         return is_way or (self.tags.get("highway") == "crossing" and isinstance(self.shape, Point))
@@ -102,7 +107,7 @@ def completed(features: Sequence[Feature], with_pavements: Sequence[str]) -> tup
             else:
                 changed[index] = feature._replace(shape=rest)
                 added.append(paint)
-        elif feature.kind == "Sidewalks" and feature.is_line and not feature.is_bridge:
+        elif feature.kind == "Sidewalks" and feature.is_line and not (feature.is_bridge or feature.is_unmarked):
             changed[index] = _up_to_kerbs(feature, carriageways)
     added += _pavements(changed, roads, carriageways, with_pavements)
     return _opened_below_bridges(changed, added), added

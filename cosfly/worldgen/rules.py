@@ -114,7 +114,7 @@ def _normalized(prompt: str) -> str:
     for words in _longest_first(WORDS["amounts"]):
         amount = WORDS["amounts"][words]  # "hardly any greenery" becomes the word "few-trees" of the choices
         text = re.sub(rf"\b{words} (?:trees|vegetation|greenery)\b", f"{amount}-trees", text)
-        text = re.sub(rf"\b{words} cars\b", f"{amount}-cars", text)
+        text = re.sub(rf"\b{words} (?:parked )?cars\b", f"{amount}-cars", text)
     return f" {text} "
 
 

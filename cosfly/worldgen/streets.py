@@ -353,9 +353,12 @@ def lay_streets(boxes: BoxList, net: Network, parked_share: float, rng: np.rando
         has_crossings = num_others[k] > 1
         if street in net.bridges:
             _furnish(plot, street, clear, has_crossings, None)
+            line = LineString([street.start, street.end])
+            over_water = shapely.get_coordinates(shapely.intersection(line, net.water))
+            ends_m = shapely.line_locate_point(line, shapely.points(over_water))
             for side in (-1, 1):
-                middle = (street.length_m / 2, side * (street.width_m - RAILING_M) / 2)
-                plot.add("Fences", middle, (street.length_m, RAILING_M), -SLAB_M, 1.1)
+                middle = ((ends_m.min() + ends_m.max()) / 2, side * (street.width_m - RAILING_M) / 2)
+                plot.add("Fences", middle, (np.ptp(ends_m), RAILING_M), -SLAB_M, 1.1)
             bridge_strips.append(strip)
         else:
             _furnish(plot, street, clear, has_crossings, parked_share)
