@@ -1,5 +1,6 @@
 """Maps of one's own: tables and GeoJSON of boxes as people write them, and what is wrong with others, all at once."""
 
+import contextlib
 import json
 import re
 from itertools import product
@@ -315,6 +316,30 @@ def test_streets_and_rows_out_of_proportion_are_refused(tmp_path):
     for features, words in ((grid, "streets with more than"), (rows, "rows of 71,250 trees")):
         with pytest.raises(InputError, match=words):
             loaded(tmp_path, collection(*features), ".geojson", type_column="highway,natural", units="m")
+
+
+STREET_TAGS = (
+    {"highway": "residential"}, {"highway": "residential", "width": "0"}, {"highway": "footway"},
+    {"highway": "footway", "footway": "crossing"}, {"highway": "crossing"}, {"highway": "secondary", "bridge": "yes"},
+    {"natural": "tree_row"}, {"natural": "water"}, {"barrier": "wall"}, {"building": "yes"},
+)  # fmt: skip
+
+
+def test_streets_of_any_shape_are_read_or_refused(tmp_path):
+    """Lines and outlines that cross themselves, end where they begin, have no length, or lie on each other."""
+    for seed in range(60, 100):  # in 86, water lies wholly below bridges
+        rng = np.random.default_rng(seed)
+        features = []
+        for _ in range(rng.integers(1, 14)):
+            line = rng.choice([0.0, 10.0, 20.0, 20.00001, 37.3], (rng.integers(2, 7), 2)).tolist()
+            coordinates = {"Point": line[0], "LineString": line, "MultiLineString": [line, line[:2]],
+                           "Polygon": [[*line, [0.0, 0.0], line[0]]]}  # fmt: skip
+            form = str(rng.choice(list(coordinates)))
+            features.append(feature(form, coordinates[form], **STREET_TAGS[rng.integers(len(STREET_TAGS))]))
+        with contextlib.suppress(InputError):
+            loaded(
+                tmp_path, collection(*features), ".geojson", type_column="building,highway,natural,barrier", units="m"
+            )
 
 
 def test_tags_of_openstreetmap_mean_what_they_say(tmp_path, caplog):

@@ -25,6 +25,7 @@ BRIDGE_NEAR_M = 15.0  # water so near to a bridge is covered apart: a long recta
 CROSSING_M = 3.0  # width of a crossing
 STRIPE_M = 0.5  # of paint, and as much between two stripes
 NODE_M = 1.0  # from a node of a crossing to its street
+SHORTEST_M = 1.0  # a shorter crossing has no stripes
 LONGEST_CROSSING_M = 20.0  # a longer piece of a footway within a carriageway runs along it
 TREE_STEP_M = 8.0  # between the trees of a row
 MOST_TREES = 50_000
@@ -100,7 +101,7 @@ def completed(features: Sequence[Feature], with_pavements: Sequence[str]) -> tup
             if not lines:
                 continue
             crossings += lines
-            paint = Feature("RoadLines", shapely.multipolygons([stripe for line in lines for stripe in _stripes(line)]))
+            paint = Feature("RoadLines", shapely.MultiPolygon([stripe for line in lines for stripe in _stripes(line)]))
             rest = feature.shape.difference(carriageways)
             if rest.is_empty or not feature.is_line:
                 changed[index] = paint
@@ -133,7 +134,7 @@ def _with_plain_shape(feature: Feature) -> Feature:
         trees = [
             line.interpolate(along_m) for line in lines for along_m in np.arange(0.0, line.length + 1e-6, TREE_STEP_M)
         ]
-        return feature._replace(shape=shapely.multipoints(trees))
+        return feature._replace(shape=shapely.MultiPoint(trees))
     if feature.kind in ("Walls", "Fences", "GuardRail") and "Polygon" in feature.shape.geom_type:
         return feature._replace(shape=feature.shape.boundary)
     return feature
@@ -151,29 +152,35 @@ def _crossing_lines(
     """
     if feature.is_line:
         for line in shapely.get_parts(feature.shape.intersection(carriageways)):
-            if 1.0 < line.length <= LONGEST_CROSSING_M:
+            if SHORTEST_M < line.length <= LONGEST_CROSSING_M and _chord_m(line) > SHORTEST_M:
                 yield line
         return
     if np.any(shapely.distance(others, feature.shape) < CROSSING_M):
         return
     for index in tree.query(feature.shape, predicate="dwithin", distance=NODE_M):
         road = roads[index]
-        if road.width_m <= LONGEST_CROSSING_M:
-            along_m = road.shape.project(feature.shape)
-            before, after = (road.shape.interpolate(max(0.0, along_m + step_m)) for step_m in (-1.0, 1.0))
-            direction = np.array([after.x - before.x, after.y - before.y]) / before.distance(after)
+        along_m = road.shape.project(feature.shape)
+        before, after = (road.shape.interpolate(max(0.0, along_m + step_m)) for step_m in (-1.0, 1.0))
+        street_m = before.distance(after)
+        if road.width_m <= LONGEST_CROSSING_M and street_m > SHORTEST_M:
+            direction = np.array([after.x - before.x, after.y - before.y]) / street_m
             across = np.array([-direction[1], direction[0]]) * road.width_m / 2
             middle = np.array(feature.shape.coords[0])
             yield LineString([middle - across, middle + across])
             return
 
 
+def _chord_m(line: LineString) -> float:
+    """Return the distance between the ends of a line."""
+    return float(np.hypot(*(np.array(line.coords[-1]) - line.coords[0])))
+
+
 def _stripes(line: LineString) -> Iterator[Any]:
     """Yield the outlines of the stripes of a crossing along a line."""
-    start, end = np.array(line.coords[0]), np.array(line.coords[-1])
-    direction = (end - start) / np.hypot(*(end - start))
+    start, length_m = np.array(line.coords[0]), _chord_m(line)
+    direction = (np.array(line.coords[-1]) - start) / length_m
     yaw_deg = float(np.degrees(np.arctan2(direction[1], direction[0])))
-    for along_m in np.arange(STRIPE_M, np.hypot(*(end - start)) - STRIPE_M / 2, 2 * STRIPE_M):
+    for along_m in np.arange(STRIPE_M, length_m - STRIPE_M / 2, 2 * STRIPE_M):
         yield rectangle_polygon(Rectangle(tuple(start + along_m * direction), (STRIPE_M, CROSSING_M), yaw_deg))
 
 
@@ -238,5 +245,5 @@ def _opened_below_bridges(features: Sequence[Feature], added: Sequence[Feature])
         if feature.kind == "Water" and (area := feature.area()).intersects(bridge_area):
             water = area.difference(bridge_area)
             parts = [*polygons_of(water.intersection(near)), *polygons_of(water.difference(near))]
-            opened[index] = feature._replace(shape=shapely.multipolygons(parts))
+            opened[index] = feature._replace(shape=shapely.MultiPolygon(parts))
     return opened
