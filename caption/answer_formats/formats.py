@@ -193,6 +193,8 @@ class Filler:
         if value in _NEITHER and slot.needs_side:
             fix = f"it is {value} here, neither side: leave this slot out, or write `is {{{slot.name}}}`"
             raise InvalidSlot(f"{{{slot.name}}}: {fix}")
+        if slot.is_amount and not isinstance(value, str) and value < 0:
+            raise InvalidSlot(f"{{{slot.name}}} is negative: name its direction by a slot for a side or a trend")
         if not isinstance(value, str):
             text = _DIGITS[digits] % (abs(value) if slot.is_paired else value)
         elif unit:  # a box

@@ -56,6 +56,7 @@ class Slot:
     # Another slot of the sentence has the same direction: a number is written without its sign, and a side is that of
     # the number, however small.
     is_paired: bool = False
+    is_amount: bool = False  # a word of the writer states its direction, so it must not be negative
     article: str = ""  # "a" before the slot, which becomes "an" if the value needs it; "" if there is none
 
     @property
@@ -91,7 +92,10 @@ def read_sentence(text: str, language: Language, num_frames: int) -> Sentence:
         texts[i + 1] = _without_repetition(slot, after, language)
         slots.append(slot)
     slots = _paired(slots, num_frames)
-    _check_amounts(slots, texts, language)
+    slots = [
+        replace(slot, is_amount=True) if _is_amount(slot, before, language) else slot
+        for slot, before in zip(slots, texts, strict=False)
+    ]
     outside = SLOT_MARK.join(texts)  # with the spaces and articles that the writer chose
     if language == "zh":  # a space before a number, none behind its unit
         texts[1:] = [re.sub(r"^ +(?=[\u4e00-\u9fff])", "", part) for part in texts[1:]]
@@ -186,16 +190,10 @@ def _direction_of(slot: Slot, num_frames: int) -> Direction | None:
     return None
 
 
-def _check_amounts(slots: list[Slot], texts: list[str], language: Language) -> None:
-    """Refuse a signed number where a word of the writer states its direction: "has fallen by -1.5 m"."""
-    for slot, before in zip(slots, texts, strict=False):
-        reference = slot.reference
-        if reference is None or slot.is_paired or reference.aspect not in ("change", "growth"):
-            continue
-        if _AMOUNT[language].search(before):
-            aspect = "side" if reference.quantity in TURNS or QUANTITIES[reference.quantity].sides else "trend"
-            word = reference._replace(aspect=aspect)
-            raise InvalidSlot(f"{{{slot.name}}}: name its direction in the same sentence with {{{word}}}")
+def _is_amount(slot: Slot, before: str, language: Language) -> bool:
+    """Return whether a word of the writer states the direction of a change: "has fallen by {change:distance}"."""
+    is_change = slot.reference is not None and slot.reference.aspect in ("change", "growth")
+    return is_change and not slot.is_paired and bool(_AMOUNT[language].search(before))
 
 
 # --- words around a slot ----------------------------------------------------------------------------------------------
