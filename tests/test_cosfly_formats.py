@@ -1,5 +1,6 @@
 """Products on disk: round trips, every error names file and field; episodes, goals in words."""
 
+import json
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -66,19 +67,23 @@ def test_fields_of_a_map_that_contradict_each_other_are_named(tmp_path, change, 
 T_S = np.arange(4) * 0.5
 
 
-PLACES_M = np.stack([T_S, T_S + 1, T_S + 20], axis=1)
-PATH = PedestrianTrajectory("path_00000", np.array([[0.0, 0], [3, 4]]), T_S, PLACES_M, np.ones(4))
-COLUMNS = (T_S, *[PLACES_M] * 3, np.ones(4), np.full(4, 5.0))
-TRACE = DroneTrace("path_00000", "muco", *COLUMNS, {"a": 1.0}, {"b": 2}, None)
+def a_path():
+    places = np.stack([T_S, T_S, 0 * T_S], axis=1)
+    return PedestrianTrajectory("path_00000", np.array([[0.0, 0], [3, 4]]), T_S, places, np.ones(4))
+
+
+def a_trace():
+    m = np.stack([T_S, T_S + 1, T_S + 20], axis=1)
+    return DroneTrace("path_00000", "muco", T_S, m, m, m, np.ones(4), np.full(4, 5.0), {"a": 1.0}, {"b": 2}, None)
 
 
 @pytest.mark.parametrize("pace", ["walk", "hurry"])
 @pytest.mark.parametrize(
-    ("write", "read", "made", "group"),
-    [(write_paths, read_paths, PATH, "paths"), (write_traces, read_traces, TRACE, "traces")],
+    ("write", "read", "make", "group"),
+    [(write_paths, read_paths, a_path, "paths"), (write_traces, read_traces, a_trace, "traces")],
 )
-def test_path_and_trace_round_trip(tmp_path, write, read, made, group, pace):
-    path, one = tmp_path / "p.json", replace(made, pace=pace)
+def test_path_and_trace_round_trip(tmp_path, write, read, make, group, pace):
+    path, one = tmp_path / "p.json", replace(make(), pace=pace)
     write(path, [one], {"map": "T", "seed": 0})
     back = read(path)[0]
     for name, value in vars(one).items():
@@ -100,27 +105,29 @@ def test_path_and_trace_round_trip(tmp_path, write, read, made, group, pace):
 def test_the_most_alike_differs_least_the_greatest_id_of_several():
     target = Appearance("man", "jacket", "red", "shorts", "blue")
     one, two = (Appearance("man", "jacket", color, "shorts", color) for color in ("red", "green"))
-    stranger = Appearance("woman", "coat", "pink", "trousers", "pink", "cap", "red")
-    people = People(target, {9: two, 8: one, 7: one, 6: stranger})
+    people = People(
+        target, {9: two, 8: one, 7: one, 6: Appearance("woman", "coat", "pink", "trousers", "pink", "cap", "red")}
+    )
     assert people.most_alike([9, 8, 7, 6]) == (8, 1)
     assert people.most_alike([6, 9]) == (9, 2)
     assert people.most_alike([6]) == (6, 4)
     assert people.most_alike([]) == (None, None)
 
 
-SEEN = {"in_view": True, "visible": True, "visibility": 0.9, "num_pixels": 40, "distance_m": 20.0, "height_m": 20.0}
-SEEN |= {"clearance_m": 12.0, "speed_mps": 1.2, "pose": (0, 0, 20, -43, 0, 0), "target_m": (20, 0, 0.9)}
+def frame(time_s: float, answer: str, **more) -> EpisodeFrame:
+    told = {"answer": answer, "in_view": True, "visible": True, "visibility": 0.9, "num_pixels": 40}
+    told |= {"distance_m": 20.0, "height_m": 20.0, "clearance_m": 12.0, "speed_mps": 1.2}
+    told |= {"pose": (0, 0, 20, -43, 0, 0), "target_m": (20, 0, 0.9)}
+    told["command"] = None if answer == "end" else (1.2, 0.0, 0.0, 0.0, -43.0)
+    return EpisodeFrame(time_s=time_s, **told | more)
 
 
-def record() -> Episode:
-    frames = [
-        EpisodeFrame(time_s=0.5 * i, answer=answer, command=None if answer == "end" else (1.2, 0, 0, 0, -43), **SEEN)
-        for i, answer in enumerate(("lead", "lead", "ok", "late", "end"))
-    ]
+def record(answers=("lead", "lead", "ok", "late", "end"), **more) -> Episode:
+    frames = tuple(frame(0.5 * i, answer) for i, answer in enumerate(answers))
     told = {"student": "rules-7", "engine": "rules", "town": "Town_7", "map_sha256": "ab" * 32, "walk": "path_00000"}
     told |= {"seed": 7, "dt_s": 0.5, "camera_px": (640, 360), "fov_deg": 90.0, "drone_radius_m": 0.5}
     told |= {"episode": "path_00000", "pace": "walk", "ended": "lost", "num_walk_frames": 9, "frames": frames}
-    return Episode(**told)
+    return Episode(**told | more)
 
 
 def test_a_record_is_read_as_it_was_written_and_tells_lead_and_decisions_apart(tmp_path):
@@ -140,7 +147,7 @@ def test_a_record_is_read_as_it_was_written_and_tells_lead_and_decisions_apart(t
 def test_a_record_that_cannot_be_is_refused(tmp_path, change, words):
     path = tmp_path / "one.json"
     write_episode(path, record())
-    change_json(path, lambda value: value.update(change))
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(InputError, match=words):
         read_episode(path)
 
@@ -165,6 +172,12 @@ def crowd(rng: np.random.Generator) -> tuple[dict[int, Appearance], SeenFrame]:
     return people, picture_of(dict(zip(seen, rng.permutation(np.arange(1, 59))[: len(seen)].tolist(), strict=True)))
 
 
+def stands_apart(relation: str, picture: SeenFrame, number: int, rivals: list[int]) -> bool:
+    where = {n: int(np.nonzero(picture.ids == n)[1][0]) for n in (number, *rivals)}
+    sign = {"left": 1, "right": -1}[relation]
+    return all(sign * where[number] < sign * where[n] for n in rivals)
+
+
 def test_a_goal_is_true_of_the_target_alone_and_says_what_is_seen():
     rng = np.random.default_rng(3)
     relations = set()
@@ -180,9 +193,7 @@ def test_a_goal_is_true_of_the_target_alone_and_says_what_is_seen():
         slots, relation = [s for s in says if s not in SIDES], [s for s in says if s in SIDES]
         rivals = [n for n in people if n not in (PERSON_ID, 1) and not {*slots} & {*target.differences(people[n])}]
         assert len(relation) == bool(rivals)  # a place is said where garments do not do
-        for side in relation:
-            own, *others = (int(np.nonzero(picture.ids == n)[1][0]) for n in (PERSON_ID, *rivals))
-            assert own < min(others) if side == "left" else own > max(others)
+        assert all(stands_apart(relation[0], picture, PERSON_ID, rivals) for _ in relation)
         relations |= {*relation}
     assert {"left", "right"} <= relations
 

@@ -274,7 +274,7 @@ def test_captions_of_another_tree_are_refused(run):
 @pytest.mark.parametrize("name", ["manifest.json", "stage.json"])
 def test_a_stage_without_its_records_is_not_finished(run, name):
     (run / "caption" / name).unlink()
-    with pytest.raises(VerifyError, match=f"not finished, or its records are missing; got no {name}"):
+    with pytest.raises(VerifyError, match=f"not finished or kept nothing, or its records are missing; got no {name}"):
         run_dir.checked_inputs(inputs_of(run))
     alone = run / "alone/captions.jsonl"
     alone.parent.mkdir()
