@@ -123,7 +123,7 @@ def make_flight(
 
 
 def seen_by(camera: Camera, positions_m: np.ndarray, rotations_deg: np.ndarray, targets_m: np.ndarray) -> dict:
-    """Give what a target record says of the view of a camera."""
+    """Return the fields of a target record about the view of a camera."""
     poses = map(world_from_camera, positions_m, rotations_deg)
     views = [view_target(target_m, pose, camera) for target_m, pose in zip(targets_m, poses, strict=True)]
     in_view = np.array([view.in_view for view in views])

@@ -41,7 +41,7 @@ from cosfly.maps.footprints import (
     polygons_of,
     with_derived_ground,
 )
-from cosfly.maps.street_features import PAVEMENT_CREDITS, Feature, completed, is_underground
+from cosfly.maps.street_features import PAVEMENT_CREDITS, PAVEMENT_M, Feature, completed, is_underground
 from cosfly.maps.units import METRES, Units, declared_units, length_m, seen_units, to_metres
 from cosfly.runtime.config import Config, read_yaml
 from cosfly.runtime.errors import ConfigError, InputError, nearest
@@ -73,7 +73,7 @@ SLAB_M = 0.3  # thickness of a surface without a height: its top is the ground
 STOREY_M, LANE_M = 3.0, 3.5
 # Width of a line, sides of a point, and height of a thing where `type_column` names the types and nothing is declared.
 DEFAULT_SIZES_M = {
-    "Buildings": (10.0, 6.0), "Roads": (7.0, SLAB_M), "Sidewalks": (2.0, SLAB_M), "RailTrack": (3.0, SLAB_M),
+    "Buildings": (10.0, 6.0), "Roads": (7.0, SLAB_M), "Sidewalks": (PAVEMENT_M, SLAB_M), "RailTrack": (3.0, SLAB_M),
     "Water": (4.0, SLAB_M), "Vegetation": (4.0, 6.0), "Poles": (0.3, 5.0), "TrafficLight": (0.4, 4.0),
     "Walls": (0.3, 2.0), "Fences": (0.2, 1.5), "GuardRail": (0.3, 0.8), "Static": (1.0, 1.0), "Terrain": (2.0, SLAB_M),
 }  # fmt: skip
@@ -143,11 +143,9 @@ class BoxesConfig(Config):
     @field_validator("types")
     @classmethod
     def _types_are_known(cls, types: dict[str, str]) -> dict[str, str]:
-        problems = [
-            f"{name} has the unknown type {kind!r}" for name, kind in types.items() if kind not in (*TYPES, NOTHING)
-        ]
+        problems = [f"{name} has the unknown type {kind!r}" for name, kind in types.items() if kind not in KINDS]
         if problems:
-            raise ValueError(f"{'; '.join(problems)}; expected one of {', '.join(TYPES)}")
+            raise ValueError(f"{'; '.join(problems)}; expected one of {', '.join(KINDS)}")
         return types
 
     @property
