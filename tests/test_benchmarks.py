@@ -19,11 +19,6 @@ scenes.town, scenes.city = lambda seed=0: load(SyntheticConfig(), seed), lambda:
 # A benchmark; arguments, with RUN for a finished run and OUT for a new directory; a pattern of what is printed; and
 # what makes the constants of the module `bench` smaller.
 CASES = (
-    ("bench_blind", "", r"\| old_town and market \| [1-9]", """
-plain = bench.load
-bench.load = lambda model, path, told: plain(model, path, [*told, "pedestrians.num_paths=1"])
-bench.FITTED_ON = 200
-"""),
     ("bench_flying", "", r"2 side by side: .* steps a second",
              "bench.NUM_DECISIONS = 4"),
     ("bench_planning", "--planners track_astar muco", r"muco \| \d+ \| 1 of 1",

@@ -184,12 +184,9 @@ def _run_stage(stage: Stage, out: Path, progress: str) -> StageResult:
     """Run a stage; a complete stage refuses other settings, and continues if there is more to do."""
     folder = out / stage.name
     before = read_manifest(folder) if (folder / "manifest.json").exists() else None
-    if before is None:
-        log.info("[%s] %s", progress, stage.name)
+    log.info("[%s] %s", progress, stage.name)
     stage.work()
     after = read_manifest(folder)
-    if before == after:
-        log.info("[%s] %s: already complete", progress, stage.name)
     return StageResult(stage, after, before == after)
 
 

@@ -79,7 +79,8 @@ def summarize(run: Path) -> RunSummary:
     if not (run / "run.yaml").is_file():
         what = "the folder is not a run directory"
         expected = "a directory that `cosfly run` wrote"
-        fix = "pass the --out of a `cosfly run`"
+        pages = " or ".join(str(page) for page in (run / "report.html", run / "map.png") if page.exists())
+        fix = "pass the --out of a `cosfly run`" + (f", or open {pages}" if pages else "")
         raise InputError(what, where=run, got="no run.yaml in it", expected=expected, fix=fix)
     cfg = load(RunConfig, run / "run.yaml")
     names = list(STAGES)

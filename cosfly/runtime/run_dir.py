@@ -294,7 +294,7 @@ class StageFolder:
         if out.exists() and not out.is_dir():
             raise StorageError("the output path is a file, not a folder", where=out, fix="choose another --out")
         if (out / "manifest.json").exists() and _is_complete(out, record, retries=retries):
-            log.debug("%s: complete for the same settings and inputs: %s", stage, out)
+            log.info("%s: already complete in %s", stage, out)
             return cls(out, stage, True)
         lock = hold_folder(out)
         try:
