@@ -15,10 +15,11 @@ from teacher_server import TeacherServer
 from cosfly.maps.footprints import footprints, rectangle_polygon
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map
-from cosfly.runtime.errors import InputError
-from cosfly.runtime.json_io import read_json, read_model, write_model
+from cosfly.runtime.config import read_yaml
+from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.json_io import read_json
 from cosfly.runtime.run_dir import read_manifest
-from cosfly.worldgen.plan import OBJECTS, PLAN_FORMAT, WorldPlan
+from cosfly.worldgen.plan import OBJECTS, PATH_M, WorldPlan
 from cosfly.worldgen.rules import plan_by_rules
 from cosfly.worldgen.stage import WorldConfig, check_world, run
 from cosfly.worldgen.streets import PATTERNS
@@ -126,7 +127,7 @@ def test_a_prompt_that_cannot_be_read_is_refused_and_a_chinese_one_in_chinese(pr
         ("Manhattan with wide avenues", "grid", "downtown"),
         ("a city with 6 avenues that meet at a roundabout", "radial", "city"),
         ("an old town of narrow winding streets", "organic", "old town"),
-        ("a hamlet along a country road", "linear", "village"),
+        ("a hamlet along a country road", "linear", "hamlet"),
         ("a university with footpaths between lawns", "campus", "campus"),
     ],
 )
@@ -197,7 +198,7 @@ def test_a_models_plan_is_followed_and_its_trace_kept(tmp_path):
     with TeacherServer() as server:
         server.text = lambda body: "<think>a town</think>```json\n" + json.dumps(PLANNED) + "\n```"
         run(WorldConfig(prompt="a small town with a statue", planner=server.url), out)
-    assert read_model(out / "plan.json", WorldPlan, PLAN_FORMAT) == WorldPlan.model_validate(PLANNED)
+    assert WorldPlan.model_validate(read_yaml(out / "plan.yaml")) == WorldPlan.model_validate(PLANNED)
     trace = read_json(out / "trace.json", what="trace")
     assert trace["answer"].startswith("<think>")
     assert trace["model"] == "test-teacher"
@@ -288,7 +289,8 @@ def test_words_after_no_are_used_only_if_they_change_something():
 
 def test_a_few_counted_buildings_stand_among_others():
     for prompt, is_whole in (("an old town with a warehouse", False), ("a suburb with 2 apartment blocks", False),
-                             ("a hamlet of 4 cottages", True), ("a port with 12 warehouses", True)):  # fmt: skip
+                             ("a hamlet of 4 cottages", True), ("a port with 12 warehouses", False),
+                             ("an industrial park with 12 warehouses", True)):  # fmt: skip
         assert by_rules(prompt).only_these == is_whole, prompt
 
 
@@ -307,22 +309,39 @@ def test_trees_leave_a_pitch_free_and_jetties_touch_a_bank():
     assert np.count_nonzero(at_bank) == 3
 
 
+def test_cranes_stand_at_the_water_bridges_are_as_asked_for_and_houses_stand_inside_the_streets():
+    plan = by_rules("a harbour with 2 cranes and a footbridge")
+    town = build(plan, "W", 0)
+    [bridge] = town.network.bridges
+    assert (bridge.width_m, bridge.road_m) == (PATH_M, 0.0)
+    places = [shapely.Point(one.xy) for one in town.placed if one.name == "crane"]
+    assert len(places) == 2
+    assert (shapely.distance(places, town.network.water.boundary) < 8.0).all()
+    assert build(by_rules("a village by a river without bridges"), "W", 0).network.bridges == []
+    city = build(by_rules("a city with a ring road"), "W", 0)
+    ring = shapely.convex_hull(shapely.multipoints([street.start for street in city.network.streets]))
+    houses = footprints(city.layout.select(of_kinds(city.layout, "Buildings")))
+    assert shapely.contains(ring, houses).all()
+    assert by_rules("an industrial park").greens == 0
+
+
 def test_an_edited_plan_gives_the_same_town_with_the_change(tmp_path):
     first = run(WorldConfig(prompt="a small village with terraced houses"), tmp_path / "first").parent
-    plan = read_model(first / "plan.json", WorldPlan, PLAN_FORMAT)
+    plan = WorldPlan.model_validate(read_yaml(first / "plan.yaml"))
     town = build(plan, "T", 0)
     houses = footprints(town.layout.select(of_kinds(town.layout, "Buildings")))
     distances_m = [shapely.distance(house, np.delete(houses, index)).min() for index, house in enumerate(houses)]
     assert np.median(distances_m) < 0.1  # in rows
-    (tmp_path / "copy.json").write_bytes((first / "plan.json").read_bytes())
-    same = run(WorldConfig(plan=tmp_path / "copy.json"), tmp_path / "same")
+    copy = tmp_path / "copy.yaml"
+    copy.write_bytes((first / "plan.yaml").read_bytes())
+    same = run(WorldConfig(plan=copy), tmp_path / "same")
     assert same.read_bytes() == (first / same.name).read_bytes()
-    write_model(tmp_path / "copy.json", plan.model_copy(update={"river_m": 20.0}), PLAN_FORMAT)
-    obeyed("world", str(tmp_path / "copy.json"), "--out", str(tmp_path / "river"))
-    assert read_json(tmp_path / "river/plan.json", what="plan")["river_m"] == 20.0
-    (tmp_path / "copy.json").write_text('{"schema": "cosfly.world_plan", "schema_version": "2", "pattern": "square"}')
-    with pytest.raises(InputError, match="pattern: Input should be"):
-        run(WorldConfig(plan=tmp_path / "copy.json"), tmp_path / "wrong")
+    copy.write_text(copy.read_text().replace("river_m: 0.0", "river_m: 20.0"))
+    obeyed("world", str(copy), "--out", str(tmp_path / "river"))
+    assert read_yaml(tmp_path / "river/plan.yaml")["river_m"] == 20.0
+    copy.write_text("pattern: square\nblok_m: 40\n")
+    with pytest.raises(ConfigError, match=r"pattern: Input should be .*blok_m: .*did you mean 'block_m'"):
+        run(WorldConfig(plan=copy), tmp_path / "wrong")
 
 
 def test_numbers_of_cars_are_not_used_and_words_say_what_they_change():

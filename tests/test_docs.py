@@ -147,7 +147,7 @@ def settings_in(text: str) -> Iterator[str]:
             yield from (f"{section}.{name}" for name in IN_CODE.findall(cells[column]))
         for names in ASSIGNED.findall(line):
             name = names[0] or names[1]
-            if name.partition(".")[0] in SETTINGS and not name.endswith((".json", ".jsonl", ".html", ".png")):
+            if name.partition(".")[0] in SETTINGS and not name.endswith((".json", ".jsonl", ".html", ".png", ".yaml")):
                 yield name
 
 

@@ -190,7 +190,7 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "delft.json.gz": lambda root, target: target.write_bytes(gzip.compress(json.dumps(sloped_city()).encode())),
     "work/flown0": copy_of("work/rules"),
     "work/flown1": copy_of("work/planner"), "work/copy": copy_of("work/release"),
-    "work/plan.json": copy_of("work/village/plan.json"),
+    "work/plan.yaml": copy_of("work/village/plan.yaml"),
     "work/unlabelled/render": copy_of("runs/quickstart/render"),
     "Qwen/Qwen3.5-2B": lambda root, target: make_random_student(target),
     "models/Qwen3.5-2B": lambda root, target: make_random_student(target),

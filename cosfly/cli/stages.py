@@ -33,7 +33,7 @@ BACKEND = SettingOption("render.backend", "Renderer: gl, pyrender, carla or unre
 )
 def world(
     job: Job,
-    prompt: Annotated[str, Argument(help="The world, in plain English, or a plan.json of another world.")],
+    prompt: Annotated[str, Argument(help="The world, in plain English, or a plan.yaml of another world.")],
     out: Annotated[Path | None, Option(show_default="worlds/<prompt>-<time>", help="New folder.")] = None,
     count: Annotated[
         int, Option(min=1, max=1000, help="Number of worlds, each with its own seed, pattern and sizes.")
@@ -44,7 +44,7 @@ def world(
 
     name = "-".join(re.findall(r"[a-z0-9]+", prompt.lower())[:5]) or "world"
     out = out or Path("worlds") / f"{name[:40]}-{time.strftime('%Y%m%d-%H%M%S')}"
-    source = {"plan": prompt} if prompt.endswith(".json") else {"prompt": prompt}
+    source = {"plan": prompt} if prompt.endswith((".yaml", ".yml")) else {"prompt": prompt}
     cfg = build(type(job.cfg.world), job.cfg.world.model_dump() | source, "world")
     folders = [out] if count == 1 else [out / f"world_{number:03}" for number in range(count)]
     seeds = range(job.cfg.seed, job.cfg.seed + count)

@@ -10,9 +10,7 @@ from typing import Any, Literal, NamedTuple, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cosfly.runtime.config import read_yaml
-from cosfly.runtime.json_io import FileFormat, Record
-
-PLAN_FORMAT = FileFormat("cosfly.world_plan", "2", "plan of a world")
+from cosfly.runtime.json_io import Record, dump_json
 
 VERGE_M = 10.0  # of lawn around the town
 PATH_M = 4.0  # width of a footpath
@@ -110,11 +108,11 @@ class WorldPlan(BaseModel):
         None, description="the town from west to east and from south to north, 80 to 2000; null: as its blocks need"
     )
     blocks_along: float = Field(4.0, ge=1.0, le=9.0, description="blocks along each side of a town without size_m")
-    block_m: float = Field(60.0, ge=30.0, le=180.0, description="mean side of a block")
+    block_m: float = Field(60.0, ge=20.0, le=180.0, description="mean side of a block")
     street_m: float = Field(16.0, ge=5.0, le=40.0, description="streets, from front to front; below 9 without cars")
     avenue_m: float = Field(24.0, ge=5.0, le=60.0, description="main streets, from front to front")
     unevenness: float = Field(0.1, ge=0.0, le=0.3, description="how much the sides of blocks differ")
-    buildings: list[Buildings] = Field([], max_length=12, description="kinds of buildings that the user names")
+    buildings: list[Buildings] = Field([], max_length=12, description="kinds of buildings that are named")
     only_these: bool = Field(False, description="there are no buildings but those of `buildings` and `objects`")
     footprint_m: Range = Field((12.0, 30.0), description="sides of other buildings")
     heights_m: Range = Field((8.0, 24.0), description="heights of other buildings")
@@ -126,9 +124,12 @@ class WorldPlan(BaseModel):
     plazas: int = Field(1, ge=0, le=20, description="paved open blocks")
     greens: int = Field(1, ge=0, le=40, description="blocks that are lawn with trees")
     river_m: float = Field(0.0, ge=0.0, le=100.0, description="width of a river; 0: none")
-    bridges: int = Field(0, ge=0, le=10, description="bridges over the river; 0: one to four")
+    bridges: int | None = Field(None, ge=0, le=10, description="bridges over the river; null: one to four")
+    bridge_m: float | None = Field(None, ge=3.0, le=40.0, description="width of bridges; null: as the streets")
     parked_share: float = Field(0.25, ge=0.0, le=1.0, description="share of parking places that are taken")
-    objects: list[NamedObject] = Field([], max_length=40, description="what the prompt names, each once")
+    objects: list[NamedObject] = Field(
+        [], max_length=40, description="objects of objects.yaml, each once, as {name: church, count: 1}"
+    )
     not_used: list[str] = Field([], max_length=200, description="words of the prompt that no other field holds")
 
     @model_validator(mode="after")
@@ -147,6 +148,13 @@ class WorldPlan(BaseModel):
             expected = f"{edges_m + LEAST_INSIDE_M:g} m for its edges, river and widest street"
             raise ValueError(f"size_m is {self.size_m[0]:g} x {self.size_m[1]:g}, but needs at least {expected}")
         return self
+
+    def to_yaml(self) -> str:
+        """Return the plan as a file to edit, which describes each field."""
+        text = "# To build this town again: cosfly world THIS_FILE --out DIR. Lengths are in m.\n"
+        for name, field in type(self).model_fields.items():
+            text += f"\n# {field.description}\n{name}: {dump_json(self.model_dump(mode='json')[name])}\n"
+        return text
 
     def kinds_of_buildings(self) -> list[Buildings]:
         """Return the kinds of buildings to build: the counted ones first, then those that take the remaining lots."""

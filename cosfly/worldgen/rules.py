@@ -15,7 +15,7 @@ from typing import Any
 from cosfly.runtime.config import read_yaml
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.seeding import rng_for
-from cosfly.worldgen.plan import OBJECTS, WorldPlan
+from cosfly.worldgen.plan import OBJECTS, PATH_M, WorldPlan
 
 
 def _words(text: str) -> list[str]:
@@ -100,9 +100,14 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
 def _normalized(prompt: str) -> str:
     """Return a prompt in lower case with numbers in digits, and with one word for phrases such as "few trees"."""
     text = prompt.lower().replace("’", "'")
+    for words in _longest_first(WORDS["amounts"]):
+        amount = WORDS["amounts"][words]  # "hardly any greenery" becomes the word "few-trees" of the choices
+        text = re.sub(rf"\b{words} (?:trees|vegetation|greenery)\b", f"{amount}-trees", text)
+        text = re.sub(rf"\b{words} (?:parked )?cars\b", f"{amount}-cars", text)
     for word in _longest_first(WORDS["numbers"]):
         text = re.sub(rf"\b{word}\b", str(WORDS["numbers"][word]), text)
     for plain, pattern in (
+        ("industrial", r"\bindustrial (?:park|estate)\b"), (r"\1-park", r"\b(business|logistics) park\b"),
         ("1-stor", r"\bsingle[- ]stor"), ("hotel-buildings", r"(?<!\d )\bhotels\b"),
         (r"apartment block\1", r"\bblock(s?) of flats\b"), ("apartments", r"\bflats\b"),
         (r"\1s of at most", r"\bthe (?:tallest|highest) (house|building)s? (?:is|are|has)\b"),
@@ -111,10 +116,6 @@ def _normalized(prompt: str) -> str:
     ):  # fmt: skip
         text = re.sub(pattern, plain, text)
     text = re.sub(r"\b([2-9]0)[- ]([1-9])\b", lambda match: str(int(match[1]) + int(match[2])), text)  # "20-5": 25
-    for words in _longest_first(WORDS["amounts"]):
-        amount = WORDS["amounts"][words]  # "hardly any greenery" becomes the word "few-trees" of the choices
-        text = re.sub(rf"\b{words} (?:trees|vegetation|greenery)\b", f"{amount}-trees", text)
-        text = re.sub(rf"\b{words} (?:parked )?cars\b", f"{amount}-cars", text)
     return f" {text} "
 
 
@@ -319,8 +320,12 @@ class _Reader:
         self._take_words(",".join(WORDS["water"]))
         if self.plan["river_m"] and re.search(r"(?:^|, )(?:rivers?|canals?|streams?), ", self.absent):
             self.not_respected.append("no river: other water, such as a harbour, is built as a river")
-        if "bridge" in self.objects:
-            self.plan["bridges"] = self._within("number of bridges", self.objects["bridge"], 1, 10)
+        num_bridges = self.objects.get("bridge", 0) + self.objects.get("footbridge", 0)
+        if re.search(r"\bbridges?\b", self.absent):
+            self.plan["bridges"] = 0
+        if num_bridges:
+            self.plan["bridges"] = self._within("number of bridges", num_bridges, 1, 10)
+            self.plan["bridge_m"] = PATH_M if "footbridge" in self.objects else None
             self.plan["river_m"] = self.plan["river_m"] or WORDS["water"]["river"][1]
         if any(OBJECTS[name].where in ("water", "bank") for name in self.objects):
             self.plan["river_m"] = self.plan["river_m"] or WORDS["water"]["harbour"][1]

@@ -19,13 +19,14 @@ from cosfly.llm.contract import NoAnswer, Reply, started
 from cosfly.maps.footprints import footprints
 from cosfly.maps.simworld import PLACEHOLDER_CM
 from cosfly.runtime.config import Config, read_yaml, shipped
+from cosfly.runtime.config import build as build_config
 from cosfly.runtime.errors import InputError, TeacherError, counts_text
 from cosfly.runtime.io import sha256_bytes, write_bytes
-from cosfly.runtime.json_io import FileFormat, read_model, validated, write_json, write_model
+from cosfly.runtime.json_io import FileFormat, validated, write_json
 from cosfly.runtime.model_json import find_object
 from cosfly.runtime.run_dir import StageFolder, Tally, hold_folder
 from cosfly.viz.topview import TopView, draw_labels, draw_map, png_bytes
-from cosfly.worldgen.plan import OBJECTS, PLAN_FORMAT, WorldPlan, assets
+from cosfly.worldgen.plan import OBJECTS, WorldPlan, assets
 from cosfly.worldgen.rules import plan_by_rules
 from cosfly.worldgen.town import CM_PER_M, MOST_OF_BLOCK, Town, build, layout_nodes, of_kinds, placement_nodes, trees_of
 
@@ -36,6 +37,7 @@ CHECKS_FORMAT = FileFormat("cosfly.world_checks", "1.0", "checks of a world")
 CREDITS = "cosfly; sizes of assets by SimWorld, maitrix-org and contributors"
 MOST_CHARACTERS = 2000  # of a prompt
 PICTURE_PX = 1000  # longer side of the picture
+MOST_LABELS = 5  # objects of a name that the picture labels
 CARS = ("Car", "Truck")
 ROAD_COST = 20  # a metre of carriageway away from crossings costs as much as 20 m of pavement
 
@@ -59,7 +61,7 @@ class WorldConfig(Config):
     """A world from text."""
 
     prompt: str = Field("", description="description of the world, in plain English; a language model may take others")
-    plan: Path | None = Field(None, description="plan.json of another world, edited or not, in place of a prompt")
+    plan: Path | None = Field(None, description="plan.yaml of another world, edited or not, in place of a prompt")
     name: str = Field("TextWorld", min_length=1, max_length=60, description="name of the world's map")
     planner: str | None = Field(
         None, description="URL of the language model that plans the world; empty: built-in rules plan it"
@@ -174,7 +176,7 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
 def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     """Make a world from a prompt or a plan; return the path of `combined_world.json`, which has Bbox.json next to it.
 
-    The other products: trace.json, plan.json, layout.json, placement.json, checks.json, map.png, and loop.yaml, the
+    The other products: trace.json, plan.yaml, layout.json, placement.json, checks.json, map.png, and loop.yaml, the
     settings for `cosfly run` on the world.
     """
     prompt = " ".join(cfg.prompt.split())
@@ -188,13 +190,13 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     if stage.is_complete:
         return product
     if cfg.plan:
-        plan, trace = read_model(cfg.plan, WorldPlan, PLAN_FORMAT), {"planner": "file", "not_used": []}
+        plan, trace = build_config(WorldPlan, read_yaml(cfg.plan), cfg.plan), {"planner": "file", "not_used": []}
     elif cfg.planner:
         plan, trace = plan_by_model(cfg, prompt, seed, out.parent / "answers")
     else:
         plan, trace = plan_by_rules(prompt, seed)
     write_json(out / "trace.json", {"prompt": prompt, **trace})
-    write_model(out / "plan.json", plan, PLAN_FORMAT)
+    write_bytes(out / "plan.yaml", plan.to_yaml().encode())
     town = build(plan, cfg.name, seed)
     _write_world(town, out)
     checks = check_world(town, plan)
@@ -217,10 +219,10 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     num_kept = 1 + len(town.placed)
     dropped = Counter(reason.replace(" ", "_") for _, reason in town.not_placed)
     tally = Tally(input=num_kept + len(town.not_placed), kept=num_kept, dropped=dropped)
-    files = ("trace.json", "plan.json", "layout.json", "placement.json", WORLD_FILE, SIZES_FILE, "checks.json")
+    files = ("trace.json", "plan.yaml", "layout.json", "placement.json", WORLD_FILE, SIZES_FILE, "checks.json")
     outputs = [out / name for name in (*files, "map.png", LOOP_FILE)]
     stage.finish(outputs, tally, num_boxes=len(town.boxes), is_valid=all(check["is_met"] for check in checks))
-    log.info("to change the town, edit a copy of %s, then: cosfly world COPY --out NEW", out / "plan.json")
+    log.info("to change the town, edit a copy of %s, then: cosfly world COPY --out NEW", out / "plan.yaml")
     log.info("make a data set of it with: cosfly run %s --out %s", out / LOOP_FILE, out / "run")
     return product
 
@@ -236,7 +238,10 @@ def _picture(town: Town, plan: WorldPlan) -> bytes:
     """Draw a town from above, with the names of its open blocks and objects, as PNG bytes."""
     view = TopView.around(np.stack(town.boxes.bounds()), PICTURE_PX)
     picture = draw_map(town.boxes, view)
-    labels = [(obj.name, obj.xy) for obj in town.placed if obj.number == 0 and OBJECTS[obj.name].where != "layout"]
+    labels = [
+        (obj.name, obj.xy)
+        for obj in town.placed if obj.number < MOST_LABELS and OBJECTS[obj.name].where != "layout"
+    ]  # fmt: skip
     for name, block in _open_blocks(town, plan):
         if not any(block.covers(shapely.Point(xy)) for _, xy in labels):
             labels.append((name, block.centroid.coords[0]))

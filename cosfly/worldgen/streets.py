@@ -8,7 +8,7 @@ paint and the ground below a few centimetres lower, so that no two share a plane
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import compress, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -271,14 +271,27 @@ def _banks(river: LineString, apart_m: float, window: Polygon) -> list[LineStrin
 
 
 def _outside_river(lines: list[Line], river: LineString, apart_m: float, banks: list[LineString]) -> list[Line]:
-    """Return the parts of lines up to the banks; parts that run along a bank within PARALLEL_M are dropped."""
+    """Return the parts of lines up to the banks. Parts that run along a bank within PARALLEL_M are dropped; the lines
+    that end at them are extended to the bank."""
     zone = shapely.buffer(river, apart_m, cap_style="flat")
-    along_banks = shapely.buffer(shapely.union_all(banks), PARALLEL_M)
+    all_banks = shapely.union_all(banks)
+    along_banks = shapely.buffer(all_banks, PARALLEL_M)
+    parts = [
+        Line(np.array(part.coords), line.width_m)
+        for line in lines
+        for part in shapely.get_parts(shapely.difference(LineString(line.points), zone))
+        if part.length > GRID_M
+    ]
+    is_dropped = [along_banks.contains(LineString(part.points)) for part in parts]
+    dropped = shapely.union_all([LineString(part.points) for part in compress(parts, is_dropped)])
     outside = []
-    for line in lines:
-        for part in shapely.get_parts(shapely.difference(LineString(line.points), zone)):
-            if part.length > GRID_M and not along_banks.contains(part):
-                outside.append(Line(np.array(part.coords), line.width_m))
+    for (points, width_m), is_out in zip(parts, is_dropped, strict=True):
+        if is_out:
+            continue
+        loose = shapely.dwithin(shapely.points(points[[0, -1]]), dropped, GRID_M)
+        at_bank = shapely.get_coordinates(shapely.shortest_line(all_banks, shapely.points(points[[0, -1]])))[::2]
+        points = np.concatenate([at_bank[:1][loose[:1]], points, at_bank[1:][loose[1:]]])
+        outside.append(Line(points, width_m))
     return outside
 
 
@@ -286,16 +299,16 @@ def _bridges(
     plan: WorldPlan, river: LineString, banks: list[LineString], crossings: np.ndarray, length_m: float
 ) -> list[Line]:
     """Return straight bridges from bank to bank: where streets cross the river, else evenly spaced."""
-    count = plan.bridges or int(np.clip(len(crossings), 1, 4))
+    count = int(np.clip(len(crossings), 1, 4)) if plan.bridges is None else plan.bridges
     x = (np.arange(count) + 0.5) / count * length_m - length_m / 2
-    if len(crossings):
+    if count and len(crossings):
         nearest = crossings[np.abs(crossings[:, 0] - x[:, None]).argmin(axis=1), 0]
         x = np.unique(np.where(np.abs(nearest - x) < 0.3 * length_m / count, nearest, x))
     lines = []
     for bridge_x in x:
         middle = shapely.intersection(river, LineString([(bridge_x, -1e4), (bridge_x, 1e4)]))
         points = [shapely.get_coordinates(shapely.shortest_line(bank, middle))[0] for bank in banks]
-        lines.append(Line(np.array(points), plan.street_m))
+        lines.append(Line(np.array(points), plan.bridge_m or plan.street_m))
     return lines
 
 

@@ -27,13 +27,14 @@ from cosfly.maps.footprints import Rectangle, footprints, oriented_rectangle, po
 from cosfly.runtime.seeding import rng_for
 from cosfly.simulators.assets import ASSETS
 from cosfly.worldgen.plan import VERGE_M, Buildings, Object, Range, WorldPlan, assets
-from cosfly.worldgen.streets import GROUND_TOP_M, lay_streets, network, pave
+from cosfly.worldgen.streets import GROUND_TOP_M, LANE_M, lay_streets, network, pave
 
 CM_PER_M = 100.0
 ROAD_PIECE_M = 200.0  # length of SimWorld's piece of road
 ROAD_SCALE = (0.95, 0.9, 1.0)  # scale of the piece at that length
 STRETCH = 6.0  # most that an asset's box may be stretched along one side relative to another
 STEP_M = 2.0  # between places that are tried
+LOT_STEP_M = 1.0  # the same along a street
 SCALES = (1.0, 0.85, 0.7, 0.6, 0.5, 0.4)
 SPACE_M = 4.0  # free ground around each object
 TREE_M = 2.5  # lower vegetation is a hedge
@@ -148,7 +149,8 @@ class Town:
         self._outline = shapely.box(-size_m[0] / 2, -size_m[1] / 2, size_m[0] / 2, size_m[1] / 2)
         self.network = network(plan, size_m, rng_for(seed, "world", "streets"))
         self._strips = self._lay_streets()  # outlines of streets, from front to front
-        between_blocks = shapely.union(shapely.union_all(self._strips), self.network.water)
+        # A millimetre wider, because rounding leaves gaps between strips that touch.
+        between_blocks = shapely.union(shapely.union_all(self._strips).buffer(1e-3), self.network.water)
         self._blocks = shapely.difference(self._outline, between_blocks)
         self._closed_blocks = self._find_closed_blocks()
         self._buildable = self._find_buildable()
@@ -159,7 +161,7 @@ class Town:
         for obj, count in sorted(plan.known_objects(), key=lambda pair: -math.prod(pair[0].size_m)):
             self._place_object(obj, count)
         self._build_houses()
-        if plan.setback_m < GARDEN_SETBACK_M:
+        if plan.setback_m < GARDEN_SETBACK_M and plan.street_m >= LANE_M:  # lanes are seen between unpaved yards
             for block in self._closed_blocks:
                 if block.area < 4 * plan.block_m**2 and block not in self.open_blocks:
                     pave(self._boxes, block, BLOCK_PIECE_M)
@@ -197,7 +199,7 @@ class Town:
     def _find_buildable(self) -> BaseGeometry:
         """Return the ground on which buildings may stand, away from three edges of the town."""
         low_x, low_y, high_x, high_y = self._outline.bounds
-        inside = shapely.union_all(self._closed_blocks) if self.plan.pattern == "campus" else self._blocks
+        inside = self._blocks if self.plan.pattern == "linear" else shapely.union_all(self._closed_blocks)
         return shapely.intersection(inside, shapely.box(2.0 + low_x, low_y, high_x - 2.0, high_y - 2.0))
 
     def _choose_open_blocks(self) -> list[Polygon]:
@@ -237,6 +239,7 @@ class Town:
         """
         streets = zip(self.network.streets, self._strips, strict=True)
         taken = [*self._taken]
+        smallest = min(sizes, key=math.prod)
         for street, strip in sorted(streets, key=lambda pair: np.linalg.norm(pair[0].start + pair[0].end)):
             front_m = street.width_m / 2 + 0.05 + setback_m  # from the centre line
             reach_m = max(map(max, sizes)) + setback_m + self.plan.gap_m
@@ -244,18 +247,19 @@ class Town:
             for side in (1, -1):
                 along_m = 0.0
                 while along_m < street.length_m:
-                    width_m, depth_m = sizes[int(rng.integers(len(sizes)))]
-                    across = (side * front_m, side * (front_m + depth_m))
-                    lot = street.rectangle((along_m, along_m + width_m), across)
-                    outline = rectangle_polygon(lot)
-                    is_taken = shapely.dwithin(np.array(near, dtype=object), outline, self.plan.gap_m).any()
-                    if is_taken or not self._buildable.contains(outline):
-                        along_m += STEP_M
-                        continue
-                    yield lot._replace(yaw_deg=lot.yaw_deg + 90.0 * (1 - side))
-                    taken.append(outline)
-                    near.append(outline)
-                    along_m += width_m + self.plan.gap_m * rng.uniform(1.0, 1.6)
+                    for width_m, depth_m in dict.fromkeys((sizes[int(rng.integers(len(sizes)))], smallest)):
+                        across = (side * front_m, side * (front_m + depth_m))
+                        lot = street.rectangle((along_m, along_m + width_m), across)
+                        outline = rectangle_polygon(lot)
+                        is_taken = shapely.dwithin(np.array(near, dtype=object), outline, self.plan.gap_m).any()
+                        if not is_taken and self._buildable.contains(outline):
+                            yield lot._replace(yaw_deg=lot.yaw_deg + 90.0 * (1 - side))
+                            taken.append(outline)
+                            near.append(outline)
+                            along_m += width_m + self.plan.gap_m * rng.uniform(1.0, 1.6)
+                            break
+                    else:
+                        along_m += LOT_STEP_M
 
     def _build_houses(self) -> None:
         """Build the counted buildings on lots spread over the town, then fill the lots that are left."""
@@ -422,12 +426,13 @@ class Town:
         is_ground = of_kinds(world, "Roads", "Terrain", "RoadLines") | (world.maxs[:, 2] <= 0.0)
         is_path = of_kinds(world, "Sidewalks") & ((2 * world.half_extents[:, :2]).min(1) < 5.0)
         obstacles = shapely.STRtree([*footprints(world)[~is_ground | is_path], *self._taken])  # and pitches
-        shapely.prepare(self._blocks)
-        low_x, low_y, high_x, high_y = self._blocks.bounds
+        ground = shapely.difference(self._blocks, shapely.union_all(self.open_blocks[: self.plan.plazas]))
+        shapely.prepare(ground)
+        low_x, low_y, high_x, high_y = ground.bounds
         for xy in rng.uniform((low_x, low_y), (high_x, high_y), (40 * count, 2)):
             crown_m = rng.uniform(3.0, 5.5)
             outline = shapely.box(*(xy - crown_m / 2), *(xy + crown_m / 2))
-            if self._blocks.contains(outline) and not len(obstacles.query(outline, predicate="dwithin", distance=0.4)):
+            if ground.contains(outline) and not len(obstacles.query(outline, predicate="dwithin", distance=0.4)):
                 boxes.add("Vegetation", xy, (crown_m, crown_m * rng.uniform(0.9, 1.1)), 0.0, rng.uniform(5.0, 11.0))
                 if len(boxes) == count:
                     break
