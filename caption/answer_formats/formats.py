@@ -51,9 +51,9 @@ class Refused:
 
 
 def fill_answer(written: Coc, facts: Facts, language: Language = "en") -> Draft | Refused:
-    """Fill the templates of an answer, or report all faults of their sentences."""
+    """Fill the templates of an answer, or report the faults of their sentences, each once."""
     filler = Filler(facts, written.flight_decision, language)
-    problems: list[str] = []
+    problems: dict[str, str] = {}  # the first place of each
     sentences: list[Sentence] = []
     texts = dict.fromkeys(TEXTS, "")
     for name in TEXTS:
@@ -63,9 +63,10 @@ def fill_answer(written: Coc, facts: Facts, language: Language = "en") -> Draft 
                 texts[name] += filler.fill(sentence)
                 sentences.append(sentence)
             except InvalidSlot as error:
-                problems.append(f"{name}, sentence {number}: {error}.")
+                problems.setdefault(str(error), f"{name}, sentence {number}")
     if problems:
-        return Refused(INVALID_SLOT, " ".join(problems[:MAX_COMPLAINTS]))
+        complaints = [f"{place}: {problem}." for problem, place in problems.items()]
+        return Refused(INVALID_SLOT, " ".join(complaints[:MAX_COMPLAINTS]))
     template = Template(critical_components=written.critical_components, reasoning_trace=written.reasoning_trace)
     coc = Coc(**texts, flight_decision=written.flight_decision)
     outside = tuple([sentence.outside for sentence in sentences])
