@@ -361,6 +361,38 @@ def test_tags_of_openstreetmap_mean_what_they_say(tmp_path, caplog):
     assert "height_m='ca. 9': the value is not a number, so a default is used" in caplog.text
 
 
+def test_bounds_crop_features_and_tables(tmp_path):
+    text = collection(
+        feature("LineString", [[-3000, 0], [3000, 0]], highway="residential", sidewalk="no"),
+        feature("Point", [500, 5], natural="tree"),
+        feature("Polygon", [[[0, 20], [90, 20], [0, 40], [90, 40], [0, 20]]], building="yes"),  # crosses itself
+    )
+    settings = {"type_column": "highway,natural,building", "units": "m"}
+    cropped = loaded(tmp_path, text, ".geojson", bounds=(-50, -50, 60, 50), **settings)
+    low, high = cropped.bounds()
+    assert_allclose([low[0], high[0]], [-50, 60], atol=4)  # boxes of lines are longer by half of their width
+    assert cropped.header.dropped_objects == {"outside_bounds": 1}
+    table = loaded(tmp_path, PLAIN, bounds=(0, -1, 30, 30))
+    assert (len(table), table.header.dropped_objects) == (2, {"outside_bounds": 1})
+    with pytest.raises(InputError, match=r"bounds contains no part .*\[100.* within -3000, 0, 3000, 40"):
+        loaded(tmp_path, text, ".geojson", bounds=(100, 100, 200, 200), **settings)
+    with pytest.raises(ValueError, match="west < east"):
+        BoxesConfig(bounds=(10, 0, 0, 10))
+
+
+def test_roofs_are_open_below_and_ponds_are_round(tmp_path):
+    circle = [list(map(list, Point(0, 0).buffer(15).exterior.coords))]
+    text = collection(
+        feature("Polygon", square(50, 0), building="roof", height="5"),
+        feature("Polygon", circle, natural="water"),
+    )
+    box_map = loaded(tmp_path, text, ".geojson", type_column="building,natural", units="m")
+    is_roof = box_map.kinds == KINDS["Buildings"]
+    assert_allclose([box_map.mins[is_roof, 2], box_map.maxs[is_roof, 2]], [[4.7], [5.0]], atol=1e-9)
+    water = union_all(footprints(box_map.select(~is_roof)))
+    assert water.symmetric_difference(Polygon(circle[0])).area < 0.05 * Polygon(circle[0]).area
+
+
 def test_water_is_open_below_bridges(tmp_path):
     """A river as a line and as an outline, a skew street with and without a bridge over it."""
     street = {"highway": "residential", "width": "8"}

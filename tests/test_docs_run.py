@@ -146,7 +146,7 @@ def _shown(page: str, begin: str) -> Callable[[Path, Path], object]:
 
 def _tagged(root: Path, target: Path) -> None:
     """Write four houses along three streets, with the tags of OpenStreetMap and of Overture."""
-    west, south, per_m = 4.36, 52.01, 1.0e-5  # degrees
+    west, south, per_m = 11.573, 48.136, 1.0e-5  # degrees
 
     def places(*corners_m: tuple[float, float]) -> list[list[float]]:
         return [[west + x * per_m, south + y * per_m] for x, y in corners_m]

@@ -44,7 +44,7 @@ from cosfly.maps.footprints import (
 from cosfly.maps.street_features import PAVEMENT_CREDITS, PAVEMENT_M, Feature, completed, is_underground
 from cosfly.maps.units import METRES, Units, declared_units, length_m, seen_units, to_metres
 from cosfly.runtime.config import Config, read_yaml
-from cosfly.runtime.errors import ConfigError, InputError, nearest
+from cosfly.runtime.errors import ConfigError, InputError, nearest, shown
 from cosfly.runtime.io import read_text
 from cosfly.runtime.json_io import read_json
 
@@ -60,11 +60,12 @@ DECLARED = ("min_height", "building:levels", "building:min_level", "lanes")
 COLUMNS = ("type", "id", "name", *NUMBERS, *DECLARED)
 SIZES = ("length_m", "width_m", "height_m", "min_height")  # numbers in metres, or texts with a unit
 OTHERS = ("z_m", "yaw_deg", "building:levels", "building:min_level", "lanes")
+OSM_COLUMNS = ("building", "highway", "natural", "leisure", "landuse", "waterway", "barrier", "class")  # of types
 PLACE = ("x_m", "y_m", "length_m", "width_m")  # every table has them; and height_m, except of surfaces
 NOTHING = "NONE"
 TYPES = [kind for kind in KINDS if kind != NOTHING]
 GEOMETRIES = ("Point", "LineString", "Polygon", "MultiPoint", "MultiLineString", "MultiPolygon")  # of GeoJSON
-NOT_MAPPED = ("unmapped_type", "underground")  # reasons to skip a valid feature
+NOT_MAPPED = ("unmapped_type", "underground", "outside_bounds")  # reasons to skip a valid feature
 LARGEST_PLACE = 1e8  # absolute value of a coordinate of GeoJSON, in any unit
 MOST_NAME = 40  # characters of a name in messages
 HSTORE_TAG = re.compile(r'"([^"\\]+)"=>"([^"\\]*)"')
@@ -77,11 +78,19 @@ DEFAULT_SIZES_M = {
     "Water": (4.0, SLAB_M), "Vegetation": (4.0, 6.0), "Poles": (0.3, 5.0), "TrafficLight": (0.4, 4.0),
     "Walls": (0.3, 2.0), "Fences": (0.2, 1.5), "GuardRail": (0.3, 0.8), "Static": (1.0, 1.0), "Terrain": (2.0, SLAB_M),
 }  # fmt: skip
+WIDE_M = 3000.0  # a wider map may have ways that leave the view
 FAR_M = 10_000.0  # a map with its middle farther from the origin is moved there
 OUTLINE_FILL = 0.9  # share of its boxes that an outline fills
-YARD_FILL = 0.98  # the same if it has holes, so that they stay open
+FINE_FILL = 0.98  # the same if it has holes, so that they stay open, and of water, whose outline is round
 OUTLINE_PIECE_M = 3.0  # pieces of an outline that are no longer are not cut again
-TABLE_SETTINGS = {"types", "ignore", "ground_z_m", "units", "type_column"}  # settings that a boxes_3d.json ignores
+TABLE_SETTINGS = {
+    "types",
+    "ignore",
+    "ground_z_m",
+    "units",
+    "type_column",
+    "bounds",
+}  # settings that a boxes_3d.json ignores
 
 
 class TypeRule(NamedTuple):
@@ -107,6 +116,7 @@ TYPE_RULES = [
 ]  # fmt: skip
 STREETS_WITH_PAVEMENTS = FEATURES["streets_with_pavements"].split("|")
 WIDTHS_M: dict[str, float] = FEATURES["widths_m"]
+ROOFS = FEATURES["roofs"].split("|")
 
 
 class BoxesConfig(Config):
@@ -131,6 +141,10 @@ class BoxesConfig(Config):
     most_skipped: float = Field(
         0.2, ge=0, le=1, description="largest share of rows or features that may be skipped because they are invalid"
     )
+    bounds: tuple[float, float, float, float] | None = Field(
+        None,
+        description="crop the map to west, south, east, north, in the file's coordinates (degrees: longitude first)",
+    )
     ignore: list[str] = Field([], description="columns or properties to ignore; ['*']: all unknown ones")
     ground_z_m: float = Field(0.0, description="height of the flat ground, in the file's coordinates, m")
     derive_ground: bool = Field(False, description="derive streets, pavements and lawn from the buildings")
@@ -147,6 +161,13 @@ class BoxesConfig(Config):
         if problems:
             raise ValueError(f"{'; '.join(problems)}; expected one of {', '.join(KINDS)}")
         return types
+
+    @field_validator("bounds")
+    @classmethod
+    def _bounds_are_ordered(cls, bounds: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if bounds and not (bounds[0] < bounds[2] and bounds[1] < bounds[3]):
+            raise ValueError("expected west, south, east, north, with west < east and south < north")
+        return bounds
 
     @property
     def type_columns(self) -> list[str]:
@@ -222,6 +243,9 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     changes["source"] = MapSource(tool=box_map.header.source.tool or "boxes", file=path.name)
     low, high = box_map.bounds()
     origin = origin_m(low, high, path)
+    width_m = float((high - low)[:2].max())
+    if suffix != ".json" and width_m > WIDE_M and not cfg.bounds:
+        log.warning("%s: the map is %.1f km wide; maps.boxes.bounds crops it", path.name, width_m / 1000)
     if np.abs(origin).max() > FAR_M:
         log.info("%s: the middle of the map, %s, becomes the origin", path.name, origin[:2].tolist())
         changes["offset_m"] = dict(zip("xyz", origin.tolist(), strict=True))
@@ -241,6 +265,8 @@ def _read_rows(cfg: BoxesConfig, path: Path, *, is_table: bool) -> BoxMap:
         rows, units = _feature_rows(cfg, path)
     if not rows:
         raise InputError("the file has no boxes", where=path, expected="at least one row or feature with a box")
+    if cfg.bounds:
+        rows = _cropped(rows, cfg.bounds, path)
     rows = _in_metres(rows, units, path, is_table=is_table)
     num_objects = len(rows)
     if not cfg.is_plain:
@@ -442,7 +468,7 @@ def _unknown_columns(names: Sequence[str], cfg: BoxesConfig) -> list[str]:
     """Return a message for each column or property that has no meaning here."""
     if "*" in cfg.ignore or not cfg.is_plain:
         return []
-    if tags := [tag for tag in ("building", "highway", "natural", "class") if tag in names]:
+    if tags := [tag for tag in OSM_COLUMNS if tag in names]:
         fix = f"set maps.boxes.type_column={','.join(tags)}"
         return [f"the properties look like those of OpenStreetMap or Overture; {fix}"]
     accepted = {*COLUMNS, *cfg.ignore}
@@ -459,6 +485,25 @@ def _number(value: Any) -> float:
 
 
 # --- coordinates ------------------------------------------------------------------------------------------------------
+
+
+def _cropped(rows: list[_Row], bounds: tuple[float, float, float, float], path: Path) -> list[_Row]:
+    """Return rows with their shapes cut at west, south, east and north, with a problem if nothing is left."""
+    cropped: list[_Row] = []
+    for row in rows:
+        try:
+            part = shapely.clip_by_rect(row.shape, *bounds)
+        except shapely.errors.ShapelyError:  # an outline that crosses itself
+            part = shapely.clip_by_rect(shapely.make_valid(row.shape), *bounds)
+        if part.is_empty and not row.problem:
+            row = row._replace(problem="it is outside maps.boxes.bounds", reason="outside_bounds")
+        cropped.append(row._replace(shape=part))
+    if all(row.problem for row in cropped) and not all(row.problem for row in rows):
+        whole = shapely.total_bounds([row.shape for row in rows])
+        expected = f"west, south, east, north within {', '.join(f'{value:.6g}' for value in whole)}"
+        what = "maps.boxes.bounds contains no part of the map"
+        raise InputError(what, where=path, got=shown(list(bounds)), expected=expected)
+    return cropped
 
 
 def _in_metres(rows: list[_Row], units: Units, path: Path, *, is_table: bool) -> list[_Row]:
@@ -528,7 +573,7 @@ def _add_row(made: _BoxesOfRows, row: _Row, cfg: BoxesConfig) -> str:
     num_before = len(boxes)
     try:
         for part in shapely.get_parts(row.shape):
-            for center, sides_m, yaw_deg in _rectangles(part, size.numbers, row.where, made.repairs):
+            for center, sides_m, yaw_deg in _rectangles(part, kind, size.numbers, row.where, made.repairs):
                 boxes.add(kind, center, sides_m, size.low_m, size.high_m, yaw_deg)
     except ValueError as error:  # so far from the origin that its size is lost
         raise _Skipped("bad_value", str(error)) from None
@@ -600,6 +645,8 @@ def _size_of(row: _Row, kind: str, value: str, cfg: BoxesConfig) -> _Size:
             source = "default"
         is_slab = is_slab or ("height_m" not in numbers and height_m == SLAB_M)
         numbers = defaults | numbers
+        if value in ROOFS and not above_m:
+            above_m = max(0.0, numbers["height_m"] - SLAB_M)
     problems = [f"{name} is missing" for name in needed if name not in numbers and name not in not_finite]
     problems += [f"{name} is not a finite number: {str(row.values[name])[:MOST_NAME]!r}" for name in not_finite]
     problems += [f"{name} must be above 0" for name in needed if numbers.get(name, 1.0) <= 0]
@@ -615,7 +662,9 @@ def _size_of(row: _Row, kind: str, value: str, cfg: BoxesConfig) -> _Size:
     return _Size(numbers, low_m, low_m + height_m, source, texts)
 
 
-def _rectangles(part: Any, numbers: Mapping[str, float], where: str, repairs: list[str]) -> Iterator[Rectangle]:
+def _rectangles(
+    part: Any, kind: str, numbers: Mapping[str, float], where: str, repairs: list[str]
+) -> Iterator[Rectangle]:
     """Yield the rectangles of a point, a line or an outline."""
     if isinstance(part, Point):
         yield Rectangle((part.x, part.y), (numbers["length_m"], numbers["width_m"]), numbers.get("yaw_deg", 0.0))
@@ -629,7 +678,7 @@ def _rectangles(part: Any, numbers: Mapping[str, float], where: str, repairs: li
                 yield Rectangle(tuple((start + end) / 2), (length + width_m / 2, width_m), yaw_deg)
     else:
         for polygon in _valid_polygons(part, where, repairs):
-            fill = YARD_FILL if polygon.interiors else OUTLINE_FILL
+            fill = FINE_FILL if polygon.interiors or kind == "Water" else OUTLINE_FILL
             pieces = cover(polygon, min_fill=fill, min_size_m=OUTLINE_PIECE_M, shares=CUT_SHARES)
             if not pieces and polygon.area > 0:  # too small to be cut
                 rectangle = oriented_rectangle(polygon)
