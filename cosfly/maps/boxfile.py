@@ -83,14 +83,8 @@ FAR_M = 10_000.0  # a map with its middle farther from the origin is moved there
 OUTLINE_FILL = 0.9  # share of its boxes that an outline fills
 FINE_FILL = 0.98  # the same if it has holes, so that they stay open, and of water, whose outline is round
 OUTLINE_PIECE_M = 3.0  # pieces of an outline that are no longer are not cut again
-TABLE_SETTINGS = {
-    "types",
-    "ignore",
-    "ground_z_m",
-    "units",
-    "type_column",
-    "bounds",
-}  # settings that a boxes_3d.json ignores
+# Settings that a boxes_3d.json ignores.
+TABLE_SETTINGS = {"types", "ignore", "ground_z_m", "units", "type_column", "bounds"}
 
 
 class TypeRule(NamedTuple):

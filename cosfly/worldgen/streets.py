@@ -288,10 +288,12 @@ def _outside_river(lines: list[Line], river: LineString, apart_m: float, banks: 
     for (points, width_m), is_out in zip(parts, is_dropped, strict=True):
         if is_out:
             continue
-        loose = shapely.dwithin(shapely.points(points[[0, -1]]), dropped, GRID_M)
-        at_bank = shapely.get_coordinates(shapely.shortest_line(all_banks, shapely.points(points[[0, -1]])))[::2]
-        points = np.concatenate([at_bank[:1][loose[:1]], points, at_bank[1:][loose[1:]]])
-        outside.append(Line(points, width_m))
+        first, last = (
+            shapely.get_coordinates(shapely.shortest_line(all_banks, end))[:1]
+            if end.dwithin(dropped, GRID_M) else np.empty((0, 2))
+            for end in map(shapely.Point, points[[0, -1]])
+        )  # fmt: skip
+        outside.append(Line(np.concatenate([first, points, last]), width_m))
     return outside
 
 
