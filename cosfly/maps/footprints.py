@@ -126,7 +126,7 @@ def cover(
 def _sizes_for(polygon: Polygon, min_size_m: float, max_size_m: float, shares: Sequence[float]) -> tuple[float, float]:
     most = MOST_PIECES if len(shares) == 1 else MOST_PIECES_OF_SHARES
     min_size_m = max(min_size_m, polygon.length / most)
-    return min_size_m, max(max_size_m, min_size_m, float(np.sqrt(polygon.area / most)))
+    return min_size_m, max(max_size_m, min_size_m, float(np.sqrt(abs(polygon.area) / most)))  # negative if invalid
 
 
 def num_cuts(polygon: Polygon, min_size_m: float, max_size_m: float, shares: Sequence[float]) -> float:
