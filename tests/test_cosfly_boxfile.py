@@ -13,7 +13,8 @@ from shapely import LineString, MultiLineString, Point, Polygon, affinity, union
 
 from cosfly.formats.boxes import BoxMap, write_boxes
 from cosfly.formats.kinds import KIND_NAMES, KINDS
-from cosfly.maps.boxfile import BoxesConfig, load
+from cosfly.maps.box_rows import BoxesConfig
+from cosfly.maps.boxfile import load
 from cosfly.maps.footprints import CUT_SHARES, footprints, num_cuts
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent

@@ -50,7 +50,7 @@ from cosfly.inspection.stage import run as inspect
 from cosfly.llm.answer_text import parse_answer
 from cosfly.llm.answers import BudgetConfig
 from cosfly.llm.protocol import check_url
-from cosfly.maps import boxfile, cityjson, simworld
+from cosfly.maps import box_rows, boxfile, cityjson, simworld
 from cosfly.runtime import console as shared
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError
 from cosfly.runtime.escaping import LONGEST, for_terminal
@@ -73,8 +73,8 @@ FRAME = f"{FLIGHT}/frames_playback/frame_00003"
 READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "boxes": ("boxes_3d.json", read_boxes),
     "region": ("roi_polygon.json", read_roi),
-    "boxes, GeoJSON": ("own.geojson", lambda path: boxfile.load(boxfile.BoxesConfig(path=path))),
-    "table of boxes": ("own.csv", lambda path: boxfile.load(boxfile.BoxesConfig(path=path))),
+    "boxes, GeoJSON": ("own.geojson", lambda path: boxfile.load(box_rows.BoxesConfig(path=path))),
+    "table of boxes": ("own.csv", lambda path: boxfile.load(box_rows.BoxesConfig(path=path))),
     "city model": ("city.json", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
     "SimWorld": ("world.json", lambda path: simworld.load(simworld.SimWorldConfig(world=path))),
     "flight": (f"{FLIGHT}/trajectory.json", lambda path: read_track(path.parent)),

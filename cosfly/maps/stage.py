@@ -11,7 +11,7 @@ from pydantic import Field
 from cosfly.formats.boxes import BoxMap, check_ground, write_boxes
 from cosfly.formats.meshes import MESHES_FILE
 from cosfly.maps import boxfile, carla_export, cityjson, simworld, synthetic, unrealcv_export
-from cosfly.maps.boxfile import BoxesConfig
+from cosfly.maps.box_rows import BoxesConfig
 from cosfly.maps.boxlist import check_not_empty
 from cosfly.maps.carla_export import CarlaMapConfig
 from cosfly.maps.cityjson import CityJsonConfig
