@@ -264,13 +264,14 @@ def test_a_limit_of_height_is_for_what_it_names(prompt, highest_m, houses_m):
 
 
 def test_positions_and_forms_are_not_used():
-    """Positions are reported; flats are apartments, flat roofs are not; the water of a harbour is a river."""
+    """Positions are reported; flats are apartments, flat roofs are not; a harbour is no river."""
     prompt = "a village with a church in the middle, surrounded by houses with flat roofs, a harbour and no river"
     plan, trace = plan_by_rules(prompt, 0)
     assert trace["not_used"] == ["flat", "middle (position)", "surrounded (position)"]
     assert [kind.name for kind in plan.buildings] == ["house"]
     assert plan.river_m
-    assert trace["not_respected"] == ["no river: other water, such as a harbour, is built as a river"]
+    assert plan.is_shore  # a harbour is no river
+    assert trace["not_respected"] == []
     for words in ("flats", "blocks of flats", "4 blocks of flats"):
         (kind,) = plan_by_rules(f"a town with {words}", 0)[0].buildings
         assert (kind.name, kind.count) == ("apartment block", 4 if "4" in words else None)
@@ -318,6 +319,8 @@ def test_cranes_stand_at_the_water_bridges_are_as_asked_for_and_houses_stand_ins
     assert len(places) == 2
     assert (shapely.distance(places, town.network.water.boundary) < 8.0).all()
     assert build(by_rules("a village by a river without bridges"), "W", 0).network.bridges == []
+    shore = build(by_rules("a harbour"), "W", 0)  # along the southern edge; rivers are in the middle
+    assert shore.network.water.bounds[1] < 0.01 - shore.size_m[1] / 2 < shore.network.water.bounds[3] < 0.0
     city = build(by_rules("a city with a ring road"), "W", 0)
     ring = shapely.convex_hull(shapely.multipoints([street.start for street in city.network.streets]))
     houses = footprints(city.layout.select(of_kinds(city.layout, "Buildings")))

@@ -3,11 +3,11 @@
 Source: app:simworld:step1, the structured high-level plan.
 """
 
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from cosfly.runtime.config import read_yaml
 from cosfly.runtime.json_io import Record, dump_json
@@ -69,6 +69,18 @@ OBJECTS = _objects()
 Range = tuple[float, float]  # low and high end
 
 
+def _within(values: Range, low: float, high: float) -> Range:
+    if not low <= values[0] <= values[1] <= high:
+        raise ValueError(f"the range must lie within {low:g} to {high:g}, the lower value first")
+    return values
+
+
+Footprint = Annotated[Range, AfterValidator(partial(_within, low=6.0, high=120.0))]
+Heights = Annotated[Range, AfterValidator(partial(_within, low=3.0, high=450.0))]
+Share = Annotated[Range, AfterValidator(partial(_within, low=0.0, high=0.8))]
+TreesPerHa = Annotated[Range, AfterValidator(partial(_within, low=0.0, high=400.0))]
+
+
 class NamedObject(Record):
     """An object of the table, and how many of it."""
 
@@ -81,17 +93,8 @@ class Buildings(Record):
 
     name: str = Field(description="what they are called, such as warehouse")
     count: int | None = Field(None, ge=1, le=1000, description="how many; null: as many as there is room for")
-    footprint_m: Range = Field((12.0, 30.0), description="sides of buildings")
-    heights_m: Range = Field((8.0, 24.0), description="heights of buildings")
-
-
-FOOTPRINT_LIMITS_M, HEIGHT_LIMITS_M = (6.0, 120.0), (3.0, 450.0)
-
-
-def _check_range(name: str, values: Range, limits: Range) -> None:
-    if not limits[0] <= values[0] <= values[1] <= limits[1]:
-        expected = f"within {limits[0]:g} to {limits[1]:g}, the lower value first"
-        raise ValueError(f"{name} is {values[0]:g} to {values[1]:g}, but must lie {expected}")
+    footprint_m: Footprint = Field((12.0, 30.0), description="sides of buildings")
+    heights_m: Heights = Field((8.0, 24.0), description="heights of buildings")
 
 
 class WorldPlan(BaseModel):
@@ -114,33 +117,27 @@ class WorldPlan(BaseModel):
     unevenness: float = Field(0.1, ge=0.0, le=0.3, description="how much the sides of blocks differ")
     buildings: list[Buildings] = Field([], max_length=12, description="kinds of buildings that are named")
     only_these: bool = Field(False, description="there are no buildings but those of `buildings` and `objects`")
-    footprint_m: Range = Field((12.0, 30.0), description="sides of other buildings")
-    heights_m: Range = Field((8.0, 24.0), description="heights of other buildings")
+    footprint_m: Footprint = Field((12.0, 30.0), description="sides of other buildings")
+    heights_m: Heights = Field((8.0, 24.0), description="heights of other buildings")
     highest_m: float | None = Field(None, ge=3.0, le=450.0, description="no building is higher; null: no limit")
-    building_share: Range = Field((0.0, 0.8), description="ground that buildings cover, of the town without water")
+    building_share: Share = Field((0.0, 0.8), description="ground that buildings cover, of the town without water")
     gap_m: float = Field(3.0, ge=0.05, le=40.0, description="between neighbouring buildings")
     setback_m: float = Field(1.0, ge=0.0, le=15.0, description="from pavement to front; from 2.5 on there are gardens")
-    trees_per_ha: Range = Field((10.0, 60.0), description="trees on a hectare of the town without water")
+    trees_per_ha: TreesPerHa = Field((10.0, 60.0), description="trees on a hectare of the town without water")
     plazas: int = Field(1, ge=0, le=20, description="paved open blocks")
     greens: int = Field(1, ge=0, le=40, description="blocks that are lawn with trees")
-    river_m: float = Field(0.0, ge=0.0, le=100.0, description="width of a river; 0: none")
+    river_m: float = Field(0.0, ge=0.0, le=100.0, description="width of a river, or of the water at a shore; 0: none")
+    is_shore: bool = Field(False, description="the water is along the southern edge, as in a harbour")
     bridges: int | None = Field(None, ge=0, le=10, description="bridges over the river; null: one to four")
     bridge_m: float | None = Field(None, ge=3.0, le=40.0, description="width of bridges; null: as the streets")
     parked_share: float = Field(0.25, ge=0.0, le=1.0, description="share of parking places that are taken")
     objects: list[NamedObject] = Field(
-        [], max_length=40, description="objects of objects.yaml, each once, as {name: church, count: 1}"
+        [], max_length=40, description=f"each once, as {{name: church, count: 1}}; names: {', '.join(OBJECTS)}"
     )
     not_used: list[str] = Field([], max_length=200, description="words of the prompt that no other field holds")
 
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
-        _check_range("footprint_m", self.footprint_m, FOOTPRINT_LIMITS_M)
-        _check_range("heights_m", self.heights_m, HEIGHT_LIMITS_M)
-        _check_range("building_share", self.building_share, (0.0, 0.8))
-        _check_range("trees_per_ha", self.trees_per_ha, (0.0, 400.0))
-        for kind in self.buildings:
-            _check_range(f"footprint_m of {kind.name}", kind.footprint_m, FOOTPRINT_LIMITS_M)
-            _check_range(f"heights_m of {kind.name}", kind.heights_m, HEIGHT_LIMITS_M)
         if self.size_m and not 80.0 <= min(self.size_m) <= max(self.size_m) <= 2000.0:
             raise ValueError(f"size_m is {self.size_m[0]:g} x {self.size_m[1]:g}, but must lie within 80 to 2000 m")
         edges_m = 2 * VERGE_M + max(self.avenue_m, self.street_m) + self.river_m

@@ -304,9 +304,10 @@ class _Reader:
     def _take_open_and_water(self) -> bool:
         """Take words of open blocks and of water, and set both; return whether open blocks are named."""
         text_before = self.text
-        for word, (field, width_m) in WORDS["water"].items():
+        has_river = bool({"bridge", "footbridge"} & {*self.objects}) or self._has(WORDS["rivers"])
+        for word, width_m in WORDS["water"].items():
             if self._has(word):
-                self.plan[field] = width_m
+                self.plan["river_m"] = width_m
         for word, field in WORDS["open"].items():
             if re.search(rf"(?:^|, ){word}s?, ", self.absent):
                 self.plan[field] = 0
@@ -318,17 +319,16 @@ class _Reader:
                 self.plan[field] = max(self.plan[field], self._within(f"number of {word}s", count, 1, most))
         has_open = self.text != text_before
         self._take_words(",".join(WORDS["water"]))
-        if self.plan["river_m"] and re.search(r"(?:^|, )(?:rivers?|canals?|streams?), ", self.absent):
-            self.not_respected.append("no river: other water, such as a harbour, is built as a river")
         num_bridges = self.objects.get("bridge", 0) + self.objects.get("footbridge", 0)
         if re.search(r"\bbridges?\b", self.absent):
             self.plan["bridges"] = 0
         if num_bridges:
             self.plan["bridges"] = self._within("number of bridges", num_bridges, 1, 10)
             self.plan["bridge_m"] = PATH_M if "footbridge" in self.objects else None
-            self.plan["river_m"] = self.plan["river_m"] or WORDS["water"]["river"][1]
+            self.plan["river_m"] = self.plan["river_m"] or WORDS["water"]["river"]
         if any(OBJECTS[name].where in ("water", "bank") for name in self.objects):
-            self.plan["river_m"] = self.plan["river_m"] or WORDS["water"]["harbour"][1]
+            self.plan["river_m"] = self.plan["river_m"] or WORDS["water"]["harbour"]
+        self.plan["is_shore"] = bool(self.plan["river_m"]) and not has_river
         return has_open
 
     def _left_over(self) -> list[str]:

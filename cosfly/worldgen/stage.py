@@ -44,7 +44,6 @@ ROAD_COST = 20  # a metre of carriageway away from crossings costs as much as 20
 TASK = """You plan a town for a generator that lays out streets, blocks and buildings. The user describes the town.
 Answer with one JSON object and nothing else. It has these fields, each of them optional:
 {fields}
-In `objects`, list once, with its count, everything that the user names and this table holds: {objects}.
 In `buildings`, list the kinds of buildings that the user names, with their number if it is said.
 Words of the user that no field holds go into `not_used`.
 Choose ranges wide enough that a random town meets them, and as narrow as the user's description."""
@@ -101,7 +100,7 @@ def check_world(town: Town, plan: WorldPlan) -> list[WorldCheck]:
     ]
     for kind in kinds:
         if kind.count is not None:
-            checks.append(_check(f"number of {kind.name}s", town.built[kind.name], 0.9 * kind.count, 1.1 * kind.count))
+            checks.append(_check(f"number of {kind.name}s", town.built[kind.name], kind.count, kind.count))
     num_planned, num_open = plan.plazas + plan.greens, len(_open_blocks(town, plan))
     checks.append(_check("plazas and green blocks", num_open, num_planned, max(num_planned, num_open)))
     if plan.highest_m is not None:
@@ -140,7 +139,7 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
     fields = "\n".join(
         f"- {name}: {field.description}; else {field.default!r}" for name, field in WorldPlan.model_fields.items()
     )
-    task = TASK.format(fields=fields, objects=", ".join(OBJECTS))
+    task = TASK.format(fields=fields)
     messages = [{"role": "system", "content": task}, {"role": "user", "content": prompt}]
     request = cfg.endpoint.request(messages, [], WorldPlan.model_json_schema(), seed)
     client = ChatClient(cfg.planner or "", cfg.endpoint)

@@ -24,7 +24,8 @@ from cosfly.worldgen.plan import PATH_M, VERGE_M, Range, WorldPlan
 # Streets.
 LANE_M = 9.0  # narrower streets have no carriageway
 
-PARALLEL_M = 16.0  # a street that is nearer to a bank or to the promenade all along is dropped
+PARALLEL_SHARE = 0.4  # of a block: a street that is nearer to the one at a bank all along is dropped
+SHORE_SWAY_M = 3.0
 GRID_M = 0.05  # of the ends of streets
 # Share of the distance between crossings within which the corners of irregular cells are one.
 SAME_CORNER_SHARE = 0.3
@@ -212,11 +213,15 @@ def linear(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Lin
     main = np.stack([x, sway * rng.uniform(-1.0, 1.0, len(x))], axis=1)
     lines = [] if plan.river_m else [Line(main, plan.avenue_m)]
     side = 1.0 if rng.random() < 0.5 else -1.0
+    if plan.is_shore:
+        main[:, 1] -= depth / 2  # in the water, which cuts the side streets
     for number, (a, b) in enumerate(pairwise(main)):
         foot = a + (b - a) * rng.uniform(0.35, 0.65)
         signs = (1.0, -1.0) if plan.river_m or number % 3 == 2 else (side,)
-        for sign in signs:
+        for sign in (1.0,) if plan.is_shore else signs:
             reach_m = min(depth / 2, pitch_m * rng.uniform(0.9, 1.3))
+            if plan.is_shore:
+                reach_m = min(depth, reach_m + plan.river_m)
             tip = foot + np.array([rng.uniform(-0.2, 0.2) * reach_m, sign * reach_m])
             lines.append(Line(np.stack([foot, tip]), plan.street_m))
         side = -side
@@ -240,28 +245,35 @@ def network(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> Network
     if not plan.river_m:
         return Network(straight_streets(lines), Polygon(), [])
     window = shapely.box(margin_m - half_x, -half_y, half_x - margin_m, half_y)
-    river = _river(size_m, rng)
+    river = _river(plan, size_m, rng)
     width_m = plan.avenue_m if plan.pattern == "linear" else plan.street_m
     crossings = shapely.get_coordinates([shapely.intersection(LineString(line.points), river) for line in lines])
     apart_m = (plan.river_m + width_m) / 2 + 0.3
-    banks = _banks(river, apart_m, window)
-    lines = _outside_river(lines, river, apart_m, banks)
+    banks = _banks(river, apart_m, window)[: 1 if plan.is_shore else 2]  # the northern one first
+    lines = _outside_river(lines, river, apart_m, banks, PARALLEL_SHARE * plan.block_m + width_m)
     lines += [Line(np.array(bank.coords), width_m) for bank in banks]
     lines += _bridges(plan, river, banks, crossings, inner_m[0])
+    water = shapely.buffer(river, plan.river_m / 2, cap_style="flat", join_style="mitre")
     # The union sets the order of the corners, on which the boxes of the water depend.
-    water = shapely.union(Polygon(), shapely.buffer(river, plan.river_m / 2, cap_style="flat", join_style="mitre"))
+    water = shapely.union(Polygon(), shapely.intersection(water, shapely.box(-half_x, -half_y, half_x, half_y)))
     streets = straight_streets(lines)
     bridges = [street for street in streets if water.contains(shapely.Point(street.at(street.length_m / 2, 0)))]
     return Network(streets, water, bridges)
 
 
-def _river(size_m: Range, rng: np.random.Generator) -> LineString:
-    """Return the middle of a river that sways from the west to the east edge of a town, and leaves it straight."""
+def _river(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> LineString:
+    """Return the middle of a river that sways from the west to the east edge of a town, and leaves it straight.
+
+    The water at a shore is a river along the southern edge.
+    """
     x = np.linspace(-size_m[0] / 2, size_m[0] / 2, 6)
-    sway = min(0.08 * size_m[1], 12.0) * rng.uniform(-1.0, 1.0, len(x))
+    sway = min(0.08 * size_m[1], SHORE_SWAY_M if plan.is_shore else 12.0) * rng.uniform(-1.0, 1.0, len(x))
     sway[0] = sway[1]
     sway[-1] = sway[-2]
-    return LineString(np.stack([x, rng.uniform(-0.1, 0.1) * size_m[1] + sway], axis=1))
+    y = rng.uniform(-0.1, 0.1) * size_m[1]
+    if plan.is_shore:
+        y = (plan.river_m - size_m[1]) / 2 - SHORE_SWAY_M
+    return LineString(np.stack([x, y + sway], axis=1))
 
 
 def _banks(river: LineString, apart_m: float, window: Polygon) -> list[LineString]:
@@ -270,12 +282,14 @@ def _banks(river: LineString, apart_m: float, window: Polygon) -> list[LineStrin
     return [bank for bank in sides if not bank.is_empty]
 
 
-def _outside_river(lines: list[Line], river: LineString, apart_m: float, banks: list[LineString]) -> list[Line]:
-    """Return the parts of lines up to the banks. Parts that run along a bank within PARALLEL_M are dropped; the lines
+def _outside_river(
+    lines: list[Line], river: LineString, apart_m: float, banks: list[LineString], parallel_m: float
+) -> list[Line]:
+    """Return the parts of lines up to the banks. Parts that run along a bank within parallel_m are dropped; the lines
     that end at them are extended to the bank."""
     zone = shapely.buffer(river, apart_m, cap_style="flat")
     all_banks = shapely.union_all(banks)
-    along_banks = shapely.buffer(all_banks, PARALLEL_M)
+    along_banks = shapely.buffer(all_banks, parallel_m)
     parts = [
         Line(np.array(part.coords), line.width_m)
         for line in lines
@@ -301,9 +315,11 @@ def _bridges(
     plan: WorldPlan, river: LineString, banks: list[LineString], crossings: np.ndarray, length_m: float
 ) -> list[Line]:
     """Return straight bridges from bank to bank: where streets cross the river, else evenly spaced."""
-    count = int(np.clip(len(crossings), 1, 4)) if plan.bridges is None else plan.bridges
+    if plan.is_shore or plan.bridges == 0:
+        return []
+    count = plan.bridges or int(np.clip(len(crossings), 1, 4))
     x = (np.arange(count) + 0.5) / count * length_m - length_m / 2
-    if count and len(crossings):
+    if len(crossings):
         nearest = crossings[np.abs(crossings[:, 0] - x[:, None]).argmin(axis=1), 0]
         x = np.unique(np.where(np.abs(nearest - x) < 0.3 * length_m / count, nearest, x))
     lines = []
