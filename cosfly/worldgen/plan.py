@@ -34,7 +34,7 @@ class Object(Record):
 
     name: str
     parts: tuple[ObjectPart, ...] = ()
-    where: Literal["open", "water", "bank", "layout"] = "open"
+    where: Literal["open", "water", "bank", "quay", "layout"] = "open"
     words: tuple[str, ...] = ()
     asset: str | None = None
     least_scale: float = 1.0

@@ -206,7 +206,7 @@ class Town:
         """Return plazas, the blocks nearest to the middle, then greens; one if only an object needs it."""
         plan = self.plan
         rng = rng_for(self.seed, "world", "open")
-        has_objects = any(obj.where == "open" for obj, _ in plan.known_objects())
+        has_objects = any(obj.where in ("open", "quay") for obj, _ in plan.known_objects())
         num_open = max(plan.plazas + plan.greens, int(has_objects))
         blocks = self._closed_blocks[: max(1, len(self._closed_blocks) // 2)]
         num_plazas = plan.plazas or int(has_objects and not plan.greens)
@@ -314,7 +314,7 @@ class Town:
         for number in range(count):
             scaled_place = self._find_place(obj, scales)
             if scaled_place is None:
-                may_exist = obj.where == "open" or not self.network.water.is_empty
+                may_exist = obj.where in ("open", "quay") or not self.network.water.is_empty
                 self.not_placed.append((obj.name, "no room" if may_exist else "no water in the plan"))
                 continue
             place, scale = scaled_place
@@ -329,7 +329,7 @@ class Town:
 
     def _find_place(self, obj: Object, scales: list[float]) -> tuple[Rectangle, float] | None:
         """Return the outline and the scale of an object where there is room, else None."""
-        if obj.where in ("water", "bank"):
+        if obj.where in ("water", "bank") or (obj.where == "quay" and self.plan.river_m):
             bridges = shapely.union_all([
                 rectangle_polygon(bridge.rectangle((0.0, bridge.length_m), (-bridge.width_m, bridge.width_m)))
                 for bridge in self.network.bridges
