@@ -238,7 +238,7 @@ def test_openstreetmap_and_overture_need_the_name_of_the_type_column(tmp_path, c
     box_map = loaded(tmp_path, collection(*overture), ".geojson", type_column="class")
     assert box_map.counts() == {"Buildings": 9, "Roads": 2, "Sidewalks": 4}
     assert box_map.header.extent_sources == {"levels": 5, "file": 4, "default": 6}
-    with pytest.raises(InputError, match="there is no type for class='x'"):
+    with pytest.raises(InputError, match="not used: class=x 1"):
         loaded(tmp_path, collection(feature("Point", way[0], **{"class": "x"})), ".geojson", type_column="class")
 
 
@@ -314,7 +314,7 @@ def test_streets_and_rows_out_of_proportion_are_refused(tmp_path):
     ends = [([[0, 3 * k], [900, 3 * k]], [[3 * k, 0], [3 * k, 900]]) for k in range(300)]
     grid = [feature("LineString", line, highway="residential") for lines in ends for line in lines]
     rows = [feature("LineString", [[0, k], [19_000, k]], natural="tree_row") for k in range(30)]
-    for features, words in ((grid, "streets with more than"), (rows, "rows of 71,250 trees")):
+    for features, words in ((grid, "streets with more than"), (rows, "71,250 trees")):
         with pytest.raises(InputError, match=words):
             loaded(tmp_path, collection(*features), ".geojson", type_column="highway,natural", units="m")
 
@@ -392,6 +392,43 @@ def test_roofs_are_open_below_and_ponds_are_round(tmp_path):
     assert_allclose([box_map.mins[is_roof, 2], box_map.maxs[is_roof, 2]], [[4.7], [5.0]], atol=1e-9)
     water = union_all(footprints(box_map.select(~is_roof)))
     assert water.symmetric_difference(Polygon(circle[0])).area < 0.05 * Polygon(circle[0]).area
+
+
+def test_surfaces_leave_water_open_and_buildings_their_passages(tmp_path, caplog):
+    caplog.set_level("INFO")
+    pond = [list(map(list, Point(30, 30).buffer(5).exterior.coords))]
+    house = [[[100, 0], [130, 0], [130, 30], [100, 30], [100, 0]]]
+    text = collection(
+        feature("Polygon", [[[0, 0], [60, 0], [60, 60], [0, 60], [0, 0]]], highway="pedestrian", area="yes"),
+        feature("Polygon", pond, natural="water"),
+        feature("Polygon", house, building="yes"),
+        feature("LineString", [[90, 15], [140, 15]], highway="footway", tunnel="building_passage"),
+        feature("LineString", [[-50, -40], [50, -40]], waterway="stream", width="3"),
+        feature("LineString", [[0, -80], [0, -20]], highway="service"),
+        feature("Polygon", [[[200, 0], [240, 0], [240, 40], [200, 40], [200, 0]]], natural="wood"),
+        feature("LineString", [[0, 70], [50, 70]], highway="residential", sidewalk="no", barrier="bollard"),
+        feature("LineString", [[0, 90], [50, 90]], barrier="bollard"),
+    )
+    columns = {"type_column": "building,highway,natural,waterway,barrier", "units": "m"}
+    box_map = loaded(tmp_path, text, ".json", **columns)  # as an editor may name it
+
+    def is_covered(kind: str, x: float, y: float) -> bool:
+        boxes = footprints(box_map)[box_map.kinds == KINDS[kind]]
+        return bool(union_all(boxes).contains(Point(x, y)))
+
+    assert is_covered("Water", 30, 30)
+    assert is_covered("Sidewalks", 10, 10)
+    assert not is_covered("Sidewalks", 30, 30)
+    assert is_covered("Buildings", 110, 5)
+    assert not is_covered("Buildings", 115, 15)
+    assert is_covered("Water", 20, -40)
+    assert not is_covered("Water", 0, -40)
+    assert np.count_nonzero(box_map.kinds == KINDS["Vegetation"]) == 25
+    assert "not used: barrier=bollard 1" in caplog.text
+    with pytest.raises(InputError, match="Overpass's own JSON"):
+        loaded(tmp_path, '{"version": 0.6, "elements": []}', ".json", **columns)
+    with pytest.raises(InputError, match=r"type_column \(did you mean 'building'"):
+        loaded(tmp_path, text, ".geojson", type_column="buildings", units="m")
 
 
 def test_water_is_open_below_bridges(tmp_path):

@@ -62,7 +62,7 @@ class BoxesConfig(Config):
     type_column: str = Field(
         "type",
         min_length=1,
-        description="column of the type; building,highway,natural for OpenStreetMap: the first that gives a type, "
+        description="column of the type; building,highway,... for OpenStreetMap: the first that gives a type, "
         "values become types by a list, other columns are ignored and sizes have defaults; class for Overture",
     )
     types: dict[str, str] = Field(
@@ -122,6 +122,15 @@ class Row(NamedTuple):
     reason: str = "bad_geometry"  # of the problem, for the counts
     kind: str = ""  # of its boxes; empty before it is found
     tag: str = ""  # the value that gives the kind
+
+
+def is_geojson(path: Path) -> bool:
+    """Return whether a JSON file is GeoJSON; InputError: it is Overpass's own JSON."""
+    value = read_json(path, what="map")
+    if isinstance(value, dict) and "elements" in value:
+        fix = "in Overpass Turbo choose Export, then GeoJSON"
+        raise InputError("the file is Overpass's own JSON", where=path, expected="GeoJSON", fix=fix)
+    return isinstance(value, dict) and value.get("type") in ("FeatureCollection", "Feature")
 
 
 def read_rows(cfg: BoxesConfig, path: Path, *, is_table: bool) -> list[Row]:
@@ -196,8 +205,12 @@ def _feature_rows(cfg: BoxesConfig, path: Path) -> tuple[list[Row], Units]:
         declared = list({str(system): system for system in systems if system is not None}.values())
         units = declared_units(declared, f"{path}: crs") or "auto"
     features = [_feature(item, number) for number, item in enumerate(items, 1)]
-    if problems := _unknown_columns(list(dict.fromkeys(name for row in features for name in row.values)), cfg):
+    names = list(dict.fromkeys(name for row in features for name in row.values))
+    if problems := _unknown_columns(names, cfg):
         raise InputError.of_all(problems, where=path, expected=f"columns {', '.join(COLUMNS)}")
+    if names and not set(cfg.type_columns) & set(names):
+        what = f"no feature has a property of maps.boxes.type_column{nearest(cfg.type_columns[0], names)}"
+        raise InputError(what, where=path, got=cfg.type_column, expected=f"some of {', '.join(names)[:300]}")
     heights = shapely.get_coordinates([feature.shape for feature in features], include_z=True)[:, 2]
     heights = heights[np.isfinite(heights) & (heights != 0)]
     if len(heights):
@@ -270,7 +283,7 @@ def _cropped(rows: list[Row], bounds: tuple[float, float, float, float], path: P
         except shapely.errors.ShapelyError:  # an outline that crosses itself
             part = shapely.clip_by_rect(shapely.make_valid(row.shape), *bounds)
         if part.is_empty and not row.problem:
-            row = row._replace(problem="it is outside maps.boxes.bounds", reason="outside_bounds")
+            row = row._replace(problem="outside maps.boxes.bounds", reason="outside_bounds")
         cropped.append(row._replace(shape=part))
     if all(row.problem for row in cropped) and not all(row.problem for row in rows):
         whole = shapely.total_bounds([row.shape for row in rows])

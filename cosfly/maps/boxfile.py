@@ -22,7 +22,7 @@ from shapely.geometry import LineString, Point, Polygon
 
 from cosfly.formats.boxes import BoxMap, MapHeader, MapSource, read_boxes
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
-from cosfly.maps.box_rows import COLUMNS, MOST_NAME, NOTHING, TYPES, BoxesConfig, Row, number_of, read_rows
+from cosfly.maps.box_rows import COLUMNS, MOST_NAME, NOTHING, TYPES, BoxesConfig, Row, is_geojson, number_of, read_rows
 from cosfly.maps.boxlist import BoxList, SkippedEntries, listed, origin_m
 from cosfly.maps.footprints import (
     CUT_SHARES,
@@ -39,11 +39,11 @@ from cosfly.maps.footprints import (
 from cosfly.maps.street_features import PAVEMENT_CREDITS, PAVEMENT_M, Feature, completed, is_underground
 from cosfly.maps.units import length_m
 from cosfly.runtime.config import read_yaml
-from cosfly.runtime.errors import ConfigError, InputError, nearest
+from cosfly.runtime.errors import ConfigError, InputError, counts_text, nearest
 
 log = logging.getLogger(__name__)
 
-SIZES = ("length_m", "width_m", "height_m", "min_height")  # numbers in metres, or texts with a unit
+SIZES = ("length_m", "width_m", "height_m", "min_height", "diameter_crown")  # numbers in metres, or texts with a unit
 OTHERS = ("z_m", "yaw_deg", "building:levels", "building:min_level", "lanes")
 NOT_MAPPED = ("unmapped_type", "underground", "outside_bounds")  # reasons to skip a valid feature
 LINE_M = 0.1  # farthest that a corner of a line may be moved
@@ -61,7 +61,7 @@ OUTLINE_FILL = 0.9  # share of its boxes that an outline fills
 FINE_FILL = 0.98  # the same if it has holes, so that they stay open, and of water, whose outline is round
 OUTLINE_PIECE_M = 3.0  # pieces of an outline that are no longer are not cut again
 # Settings that a boxes_3d.json ignores.
-TABLE_SETTINGS = {"types", "ignore", "ground_z_m", "units", "type_column", "bounds"}
+TABLE_SETTINGS = ("types", "ignore", "ground_z_m", "units", "type_column", "bounds")
 
 
 class TypeRule(NamedTuple):
@@ -126,14 +126,12 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
         raise InputError(
             "the file type of the map is not supported", where=path, got=path.suffix, expected=".json, .csv or .geojson"
         )
-    if suffix == ".json":
-        if cfg.model_dump(include=TABLE_SETTINGS) != BoxesConfig().model_dump(include=TABLE_SETTINGS):
-            raise ConfigError(
-                "boxes_3d.json contains its own types, units and ground height, so settings for them would have no "
-                "effect",
-                where="maps.boxes",
-                fix=f"remove the settings {', '.join(f'maps.boxes.{name}' for name in sorted(TABLE_SETTINGS))}",
-            )
+    is_ours = suffix == ".json" and not is_geojson(path)
+    if is_ours:
+        defaults = BoxesConfig()
+        if names := [name for name in TABLE_SETTINGS if getattr(cfg, name) != getattr(defaults, name)]:
+            what = "boxes_3d.json contains its own types, units and ground height, so these settings have no effect"
+            raise ConfigError(what, where="maps.boxes", got=", ".join(names), fix="remove them")
         box_map = read_boxes(path)
     else:
         box_map = _read_rows(cfg, path, is_table=suffix == ".csv")
@@ -142,13 +140,13 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     low, high = box_map.bounds()
     origin = origin_m(low, high, path)
     width_m = float((high - low)[:2].max())
-    if suffix != ".json" and width_m > WIDE_M and not cfg.bounds:
+    if not is_ours and width_m > WIDE_M and not cfg.bounds:
         log.warning("%s: the map is %.1f km wide; maps.boxes.bounds crops it", path.name, width_m / 1000)
     if np.abs(origin).max() > FAR_M:
         log.info("%s: the middle of the map, %s, becomes the origin", path.name, origin[:2].tolist())
         changes["offset_m"] = dict(zip("xyz", origin.tolist(), strict=True))
         box_map = replace(box_map, centers=box_map.centers - origin)
-    if suffix != ".json" and box_map.header.derived_ground:
+    if not is_ours and box_map.header.derived_ground:
         changes["credits"] = credits_with(PAVEMENT_CREDITS, cfg.credits)
     box_map = replace(box_map, header=box_map.header.model_copy(update=changes))
     return with_derived_ground(box_map) if cfg.derive_ground else box_map
@@ -165,9 +163,10 @@ def _read_rows(cfg: BoxesConfig, path: Path, *, is_table: bool) -> BoxMap:
     _check_and_report(made, rows, ids, cfg, path)
     header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=num_objects)
     changes: dict[str, Any] = {"dropped_objects": dict(made.dropped.counts)} if made.dropped.counts else {}
-    if num_derived := sum(index >= num_objects for index in made.row_of_box):
-        log.info("%s: %d boxes of pavements and crossings are added to streets", path.name, num_derived)
-        changes |= {"added_boxes": num_derived, "derived_ground": num_derived}
+    if added := Counter(rows[index].kind for index in made.row_of_box if index >= num_objects):
+        log.info("%s: added boxes of pavements, crossings and woods: %s", path.name, counts_text(added))
+        num_ground = sum(count for kind, count in added.items() if KINDS[kind] in GROUND_KINDS)
+        changes |= {"added_boxes": added.total()} | ({"derived_ground": num_ground} if num_ground else {})
     if set(made.size_sources) != {"file"}:
         changes["extent_sources"] = dict(made.size_sources)
     box_map = made.boxes.box_map(header.model_copy(update=changes))
@@ -284,7 +283,7 @@ def _with_kind(row: Row, cfg: BoxesConfig) -> Row:
 def _kind_and_tag(row: Row, cfg: BoxesConfig) -> tuple[str, str]:
     """Return the kind of a row and its value in the first column that gives one; _Skipped: no column does."""
     if not cfg.is_plain and is_underground(row.values):
-        raise _Skipped("underground", "it is below the ground")
+        raise _Skipped("underground", "below the ground")
     columns = [column for column in cfg.type_columns if row.values.get(column)] or cfg.type_columns[:1]
     values = {column: str(row.values.get(column) or "") for column in columns}
     for column, value in values.items():
@@ -292,7 +291,7 @@ def _kind_and_tag(row: Row, cfg: BoxesConfig) -> tuple[str, str]:
         if kind in TYPES:
             return kind, value
         if kind == NOTHING:
-            raise _Skipped("unmapped_type", f"maps.boxes.types drops {value[:MOST_NAME]!r}")
+            raise _Skipped("unmapped_type", f"{value[:MOST_NAME]!r}, which maps.boxes.types drops,")
         if cfg.is_plain:
             raise _Skipped("unknown_type", f"unknown type {value[:MOST_NAME]!r}{nearest(value, [*TYPES, *cfg.types])}")
         for rule in TYPE_RULES:
@@ -301,13 +300,11 @@ def _kind_and_tag(row: Row, cfg: BoxesConfig) -> tuple[str, str]:
                     return rule.kind, value
                 break  # no boxes
     if not any(values.values()):
-        properties = ", ".join(row.values)[:80] or "none"
-        problem = f"maps.boxes.type_column names no property of this feature, which has {properties}"
+        problem = "without a property of maps.boxes.type_column"
     elif row.values.get("highway") == "crossing":
-        problem = "the node is on a mapped crossing, is an unmarked crossing, or is on no street"
+        problem = "crossings that are unmarked, on another crossing or on no street"
     else:
-        tags = ", ".join(f"{column}={value[:MOST_NAME]!r}" for column, value in values.items())
-        problem = f"there is no type for {tags}; maps.boxes.types can name one"
+        problem = " ".join(f"{column}={value[:MOST_NAME]}" for column, value in values.items())
     raise _Skipped("unmapped_type", problem)
 
 
@@ -323,6 +320,8 @@ def _size_of(row: Row, cfg: BoxesConfig) -> _Size:
     if "height_m" not in numbers and "building:levels" in numbers:
         numbers["height_m"] = numbers["building:levels"] * STOREY_M
         source = "levels"
+    if row.kind == "Vegetation" and "diameter_crown" in numbers:
+        numbers |= {name: numbers["diameter_crown"] for name in ("length_m", "width_m") if name not in numbers}
     if "LineString" in forms and "lanes" in numbers:
         numbers.setdefault("width_m", numbers["lanes"] * LANE_M)
     above_m = numbers.get("min_height", numbers.get("building:min_level", 0.0) * STOREY_M)

@@ -31,6 +31,7 @@ GroundHeight = Annotated[
 ]
 Pair = Sequence[float] | np.ndarray  # x and y
 WIDEST_M = 20_000.0  # of a map
+MOST_UNUSED = 600  # characters of a message
 # Tops of the surfaces, m. At least two centimetres apart: a depth buffer separates them at 300 m.
 PAVED_TOP_M, LAWN_TOP_M, ROAD_TOP_M = 0.0, -0.02, -0.06
 PAINT_TOP_M, BASE_TOP_M = -0.03, -0.12  # over and below ROAD_TOP_M
@@ -99,29 +100,35 @@ class BoxList:
 
 
 class SkippedEntries:
-    """The entries of a file that a reader does not use, with the problems of bad ones."""
+    """The entries of a file that a reader does not use: bad ones with a problem, and others."""
 
     def __init__(self) -> None:
         self.counts = Counter[str]()  # by reason
         self.num_bad = 0
         self._places = defaultdict[str, list[str]](list)  # by problem, so that each problem is listed once
+        self._unused = Counter[str]()  # why entries that are not bad are not used
 
     def add(self, reason: str, where: str = "", problem: str = "", *, is_bad: bool = True) -> None:
         """Count an entry; one with a problem is listed, and counts as bad unless `is_bad` is false."""
         self.counts[reason] += 1
-        if problem:
+        if not is_bad:
+            self._unused[problem] += 1
+        elif problem:
             self._places[problem].append(where)
-            self.num_bad += is_bad
+            self.num_bad += 1
 
     def check(self, path: Path, num_entries: int, most_share: float, expected: str) -> None:
         """Raise InputError if more than a share of the entries is bad; log the problems."""
         problems = [listed(places, problem) for problem, places in self._places.items()]
+        unused = [f"not used: {counts_text(self._unused)}"[:MOST_UNUSED]] if self._unused else []
         if self.num_bad > most_share * num_entries:
-            raise InputError.of_all(problems, where=path, expected=expected)
+            raise InputError.of_all(problems + unused, where=path, expected=expected)
         for problem in problems[:MOST_NAMED]:
             log.warning("%s: skipped: %s", path.name, problem)
         if len(problems) > MOST_NAMED:
             log.warning("%s: skipped for %d other reasons", path.name, len(problems) - MOST_NAMED)
+        for text in unused:
+            log.info("%s: %s", path.name, text)
 
 
 def listed(places: list[str], problem: str) -> str:

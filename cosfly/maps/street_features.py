@@ -1,8 +1,9 @@
 """Features of OpenStreetMap and Overture to what a street is for pedestrians.
 
 Such data draw streets as lines: without pavements, with footways that end in the middle of the carriageway, crossings
-as nodes or lines, and rivers that run through bridges. Here streets get pavements and crossings get stripes, footways
-end at the kerb, and water is open below bridges. Rows of trees become trees, and closed walls stay lines.
+as nodes or lines, rivers that run through bridges, and squares over their fountains. Here streets get pavements and
+crossings get stripes, footways end at the kerb, water is open below bridges and is not covered elsewhere. Woods and
+rows of trees become trees, passages open buildings, and closed walls stay lines.
 """
 
 from collections import defaultdict
@@ -22,12 +23,13 @@ PAVEMENT_M = 2.0  # width
 WITHOUT_PAVEMENT = ("no", "none", "separate")  # values of `sidewalk`; separate: mapped as a way of its own
 BRIDGE_EDGE_M = 0.5  # at each side: the default of pedestrians.safety_radius_m
 BRIDGE_NEAR_M = 15.0  # water so near to a bridge is covered apart: a long rectangle would reach into the opening
+NARROW_WATER = ("stream", "ditch", "drain")  # which a street crosses on a culvert, without a tag
 CROSSING_M = 3.0  # width of a crossing
 STRIPE_M = 0.5  # of paint, and as much between two stripes
 NODE_M = 1.0  # from a node of a crossing to its street
 SHORTEST_M = 1.0  # a shorter crossing has no stripes
 LONGEST_CROSSING_M = 20.0  # a longer piece of a footway within a carriageway runs along it
-TREE_STEP_M = 8.0  # between the trees of a row
+TREE_STEP_M = 8.0  # between the trees of a row or a wood
 MOST_TREES = 50_000
 MOST_CROSSINGS, MOST_CROSSINGS_PER_STREET = 10_000, 50  # of the streets of a map
 
@@ -48,6 +50,10 @@ class Feature(NamedTuple):
     @property
     def is_tree_row(self) -> bool:
         return self.value == "tree_row" and self.is_line
+
+    @property
+    def is_wood(self) -> bool:
+        return self.value in ("wood", "forest") and "Polygon" in self.shape.geom_type
 
     @property
     def is_bridge(self) -> bool:
@@ -90,10 +96,12 @@ def completed(features: Sequence[Feature], with_pavements: Sequence[str]) -> tup
     roads = [feature for feature in features if feature.kind == "Roads" and feature.is_line]
     tree = shapely.STRtree([road.shape for road in roads])
     _check_work(features, tree)
-    changed = [_with_plain_shape(feature) for feature in features]
+    passages = shapely.union_all([one.area() for one in features if one.tags.get("tunnel") == "building_passage"])
+    changed = [_with_plain_shape(feature, passages) for feature in features]
     carriageways = shapely.union_all([road.area() for road in roads])
     shapely.prepare(carriageways)
-    added: list[Feature] = []
+    woods = [_trees_in(feature.area()) for feature in features if feature.is_wood]
+    added = [Feature("Vegetation", trees, "tree") for trees in woods if not trees.is_empty]
     crossings: list[LineString] = []
     for index, feature in sorted(enumerate(changed), key=lambda pair: not pair[1].is_line):  # nodes after ways
         if feature.is_crossing:
@@ -111,15 +119,16 @@ def completed(features: Sequence[Feature], with_pavements: Sequence[str]) -> tup
         elif feature.kind == "Sidewalks" and feature.is_line and not (feature.is_bridge or feature.is_unmarked):
             changed[index] = _up_to_kerbs(feature, carriageways)
     added += _pavements(changed, roads, carriageways, with_pavements)
-    return _opened_below_bridges(changed, added), added
+    return _uncovered(_open_below_bridges(changed, added)), added
 
 
 def _check_work(features: Sequence[Feature], streets: shapely.STRtree) -> None:
     """Raise InputError if rows have too many trees, or streets cross each other too often."""
     fix = "cut out a part of the map"
     num_trees = sum(feature.shape.length for feature in features if feature.is_tree_row) / TREE_STEP_M
+    num_trees += sum(feature.shape.area for feature in features if feature.is_wood) / TREE_STEP_M**2
     if num_trees > MOST_TREES:
-        raise over_limit("map", f"rows of {num_trees:,.0f} trees", f"{MOST_TREES:,} trees", fix)
+        raise over_limit("map", f"{num_trees:,.0f} trees of rows and woods", f"{MOST_TREES:,} trees", fix)
     num_crossings, most = 0, MOST_CROSSINGS + MOST_CROSSINGS_PER_STREET * len(streets)
     for street in streets.geometries:
         num_crossings += len(streets.query(street, predicate="intersects"))
@@ -127,8 +136,9 @@ def _check_work(features: Sequence[Feature], streets: shapely.STRtree) -> None:
             raise over_limit("map", f"streets with more than {most:,} crossings", f"{most:,} for their number", fix)
 
 
-def _with_plain_shape(feature: Feature) -> Feature:
-    """Return a feature with a row of trees as points, and a closed barrier, which is exported as an area, as a line."""
+def _with_plain_shape(feature: Feature, passages: Any) -> Feature:
+    """Return a feature with a row of trees as points, a closed barrier, which is exported as an area, as a line, and a
+    building without its passages."""
     if feature.is_tree_row:
         lines = shapely.get_parts(feature.shape)
         trees = [
@@ -137,7 +147,17 @@ def _with_plain_shape(feature: Feature) -> Feature:
         return feature._replace(shape=shapely.MultiPoint(trees))
     if feature.kind in ("Walls", "Fences", "GuardRail") and "Polygon" in feature.shape.geom_type:
         return feature._replace(shape=feature.shape.boundary)
+    if feature.kind == "Buildings" and feature.area().intersects(passages):
+        return feature._replace(shape=feature.area().difference(passages))
     return feature
+
+
+def _trees_in(wood: Any) -> Any:
+    """Return the trees of a wood as points."""
+    low_x, low_y, high_x, high_y = np.nan_to_num(wood.bounds) + TREE_STEP_M / 2  # NaN: of an outline without area
+    x, y = np.meshgrid(np.arange(low_x, high_x, TREE_STEP_M), np.arange(low_y, high_y, TREE_STEP_M))
+    trees = shapely.points(x.ravel(), y.ravel())
+    return shapely.multipoints(trees[shapely.contains(wood, trees)])
 
 
 # --- crossings --------------------------------------------------------------------------------------------------------
@@ -235,15 +255,30 @@ def _pavement_sides(tags: Mapping[str, Any]) -> list[float]:
 # --- bridges ----------------------------------------------------------------------------------------------------------
 
 
-def _opened_below_bridges(features: Sequence[Feature], added: Sequence[Feature]) -> list[Feature]:
-    """Return the features with water cut out below bridges, because nobody walks over water."""
-    bridges = [one for one in (*features, *added) if one.is_bridge and KINDS.get(one.kind) in GROUND_KINDS]
-    bridge_area = shapely.union_all([bridge.area(BRIDGE_EDGE_M) for bridge in bridges])
-    near = bridge_area.buffer(BRIDGE_NEAR_M, cap_style="flat")
+def _open_below_bridges(features: Sequence[Feature], added: Sequence[Feature]) -> list[Feature]:
+    """Return the features with water cut out below bridges, and streams below streets: nobody walks over water."""
+    surfaces = [one for one in (*features, *added) if KINDS.get(one.kind) in GROUND_KINDS]
+    bridges = shapely.union_all([one.area(BRIDGE_EDGE_M) for one in surfaces if one.is_bridge])
+    streets = shapely.union_all([one.area(BRIDGE_EDGE_M) for one in surfaces if one.is_line])  # above culverts
     opened = list(features)
     for index, feature in enumerate(features):
-        if feature.kind == "Water" and (area := feature.area()).intersects(bridge_area):
-            water = area.difference(bridge_area)
+        opening = shapely.union(bridges, streets) if feature.value in NARROW_WATER else bridges
+        if feature.kind == "Water" and (area := feature.area()).intersects(opening):
+            near = opening.buffer(BRIDGE_NEAR_M, cap_style="flat")
+            water = area.difference(opening)
             parts = [*polygons_of(water.intersection(near)), *polygons_of(water.difference(near))]
             opened[index] = feature._replace(shape=shapely.MultiPolygon(parts))
     return opened
+
+
+def _uncovered(features: Sequence[Feature]) -> list[Feature]:
+    """Return the features with surfaces cut out where they cover water: a fountain in a square, a path into a pond."""
+    water = shapely.union_all([feature.area() for feature in features if feature.kind == "Water"])
+    shapely.prepare(water)
+    uncovered = list(features)
+    for index, feature in enumerate(features):
+        if feature.kind in ("Roads", "Sidewalks", "Ground"):
+            shape = feature.shape if feature.is_line else feature.area()  # valid
+            if water.intersects(shape) and not (rest := shape.difference(water)).is_empty:
+                uncovered[index] = feature._replace(shape=rest)
+    return uncovered
