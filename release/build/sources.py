@@ -219,6 +219,6 @@ def choose_licence(licence: str | None, maps: list[tuple[str, str]]) -> str:
             "the maps state no licence, or different ones", where="release.licence",
             got=", ".join(f"{town}: {map_licence}" for town, map_licence in maps),
             expected="a licence identifier of the Hugging Face Hub",
-            fix="pass --set release.licence=LICENCE, such as cc-by-4.0, or set that of the map (maps.boxes.licence)",
+            fix="pass --set release.licence=LICENCE, such as cc-by-4.0, or that of the map, such as maps.boxes.licence",
         )  # fmt: skip
     return chosen
