@@ -328,6 +328,21 @@ def test_cranes_stand_at_the_water_bridges_are_as_asked_for_and_houses_stand_ins
     assert by_rules("an industrial park").greens == 0
 
 
+def test_a_height_of_one_building_is_not_that_of_all():
+    for prompt, unused in (("a village with a church whose tower is 30 m tall", "30 m tall"),
+                           ("a small town with a church with a 40 m tower", "40 m"),
+                           ("a town with 25 buildings, some of them ten floors high", "10 floors high")):  # fmt: skip
+        plan, trace = plan_by_rules(prompt, 0)
+        assert max(kind.heights_m[1] for kind in plan.kinds_of_buildings()) < 20.0, prompt
+        assert unused in trace["not_used"]
+    assert by_rules("a town with buildings 15-20 m tall").heights_m == (15.0, 20.0)
+    assert [kind.count for kind in by_rules("a suburb of 40 single-family houses").buildings] == [40]
+    assert by_rules("a large dense old town").blocks_along == 9.0  # the most that is possible
+    empty = build(by_rules("a town with a lake and no buildings"), "W", 0)
+    assert not of_kinds(empty.layout, "Buildings").any()
+    check_world(empty, empty.plan)
+
+
 def test_an_edited_plan_gives_the_same_town_with_the_change(tmp_path):
     first = run(WorldConfig(prompt="a small village with terraced houses"), tmp_path / "first").parent
     plan = WorldPlan.model_validate(read_yaml(first / "plan.yaml"))

@@ -158,7 +158,7 @@ class WorldPlan(BaseModel):
         ordinary = Buildings(name="building", footprint_m=self.footprint_m, heights_m=self.heights_m)
         fill = [group for group in self.buildings if group.count is None]
         counted = [group for group in self.buildings if group.count is not None]
-        if not fill and not (self.only_these and counted):
+        if not fill and not self.only_these:
             fill = [ordinary]
         return counted + fill
 

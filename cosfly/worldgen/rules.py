@@ -30,7 +30,10 @@ WORDS = read_yaml(Path(__file__).with_name("words.yaml"))
 POSITIONS = set(_words(WORDS["positions"]))
 STOPS = set(_words(WORDS["stops"])) | POSITIONS
 ORDINARY = set(_words(WORDS["ordinary"]))
-FIELD_BOUNDS = {"gap_m": (0.05, 40.0), "street_m": (5.0, 40.0), "avenue_m": (5.0, 60.0), "parked_share": (0.0, 0.9)}
+FIELD_BOUNDS = {
+    "gap_m": (0.05, 40.0), "street_m": (5.0, 40.0), "avenue_m": (5.0, 60.0), "parked_share": (0.0, 0.9),
+    "blocks_along": (1.0, 9.0), "block_m": (20.0, 180.0),
+}  # fmt: skip
 SEVERAL, SEVERAL_OPEN = 4, 3  # objects, and open blocks, of a plural without a number
 FEW = 5  # fewer buildings than that are not a whole town, but stand among others
 STOREY_M = 3.2
@@ -67,6 +70,10 @@ _EXCEPT = (
     r"(?:except(?: for)?|other than|apart from"
     r"|but(?= (?:the|an?)(?: (?!is|are|may|can)[\w-]+){1,3}(?:[,.]| $| (?:is|are|may be|can be) (?:higher|taller))))"
 )
+# Before a height of one building: "a 40 m tower", "a church whose tower is 30 m tall", "some of them 10 floors high"
+_OF_ONE = re.compile(
+    r"(?:\b(?:an?|whose [\w-]+(?: [\w-]+)? (?:is|are)|(?:some|one|a few|\d+) of (?:them|which)(?: are| is)?)) $"
+)
 _SIZES = {
     "sides": rf"{_NUMBER} ?(?:{_LENGTH})? ?(?:x|×|by|times) ?{_NUMBER} ?{_LENGTH}",  # "600 x 400 m"
     "square": rf"{_NUMBER} ?{_LENGTH} (?:square\b|across|on (?:a|each) side)",  # "500 m across"
@@ -82,7 +89,7 @@ _BUILDINGS = [
     f"{name}, {row['words']}" for name, row in WORDS["buildings"].items() if name not in ("house", "building")
 ]
 _CAN_BE_ABSENT = [
-    *("high", "tall", "vehicle", "traffic", "tree", "vegetation", "car", "cars"),
+    *("high", "tall", "building", "vehicle", "traffic", "tree", "vegetation", "car", "cars"),
     *WORDS["open"], *WORDS["water"], *OBJECTS, *(word for obj in OBJECTS.values() for word in obj.words),
     *(word for words in _BUILDINGS for word in _words(words)),
 ]  # fmt: skip
@@ -107,6 +114,8 @@ def _normalized(prompt: str) -> str:
     for word in _longest_first(WORDS["numbers"]):
         text = re.sub(rf"\b{word}\b", str(WORDS["numbers"][word]), text)
     for plain, pattern in (
+        # "a church whose tower": a part of it, which is not used
+        (r"\1 steeple", r"\b((?:church|chapel|cathedral|castle)(?: (?!and\b)[\w-]+){1,4})(?<!clock)(?<!bell) tower\b"),
         ("industrial", r"\bindustrial (?:park|estate)\b"), (r"\1-park", r"\b(business|logistics) park\b"),
         ("1-stor", r"\bsingle[- ]stor"), ("hotel-buildings", r"(?<!\d )\bhotels\b"),
         (r"apartment block\1", r"\bblock(s?) of flats\b"), ("apartments", r"\bflats\b"),
@@ -116,6 +125,7 @@ def _normalized(prompt: str) -> str:
     ):  # fmt: skip
         text = re.sub(pattern, plain, text)
     text = re.sub(r"\b([2-9]0)[- ]([1-9])\b", lambda match: str(int(match[1]) + int(match[2])), text)  # "20-5": 25
+    text = re.sub(r"\b(\d+) ?[-–] ?(\d+)\b", r"\1 to \2", text)  # "15-20 m"
     return f" {text} "
 
 
@@ -170,6 +180,8 @@ class _Reader:
             self.plan[name] = _scaled(self.plan[name], rng_for(seed, "world", name).uniform(*factors))
         self._set_heights()
         self._set_size()
+        if re.search(r"\bbuildings?\b", self.absent) and not self.buildings:
+            self.plan["only_these"] = True
         if re.search(r"\b(?:vehicles?|traffic)\b", self.absent):
             self.plan["parked_share"] = 0.0
         for name, (low, high) in FIELD_BOUNDS.items():
@@ -233,6 +245,10 @@ class _Reader:
         while match := self._take(_WIDTH, keep=r"\1 ,"):  # before heights and the word "wide", which would misread it
             self.not_used.append(match[0].strip())
         self.heights = self._take_named(_HEIGHTS)
+        if "exactly" in self.heights and _OF_ONE.search(
+            self.heights["exactly"].string[: self.heights["exactly"].start()]
+        ):
+            self.not_used.append(self.heights.pop("exactly")[0].strip())
         self.has_exception = bool(self.heights and self._take(rf"\b{_EXCEPT}\b"))
         limits = [name for name in self.heights if name != "at_least"]
         for name in limits[1:]:  # only the first limits the highest building

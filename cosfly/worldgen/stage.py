@@ -89,8 +89,8 @@ def check_world(town: Town, plan: WorldPlan) -> list[WorldCheck]:
     houses = town.layout.select(of_kinds(town.layout, "Buildings"))
     buildings = world.select(of_kinds(world, "Buildings"))  # also those of objects
     kinds = plan.kinds_of_buildings()
-    low = min(kind.heights_m[0] for kind in kinds)
-    high = max(kind.heights_m[1] for kind in kinds)
+    low = min((kind.heights_m[0] for kind in kinds), default=0.0)
+    high = max((kind.heights_m[1] for kind in kinds), default=0.0)
     heights_m = houses.maxs[:, 2] if len(houses) else [low]
     checks = [
         _check("building share", shapely.area(footprints(houses)).sum() / town.land_m2, *plan.building_share),
@@ -214,7 +214,10 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     counts.update({kind.name: town.built[kind.name] for kind in plan.kinds_of_buildings()})
     counts["parked car"] = int(of_kinds(town.layout, *CARS).sum())
     place = trace.get("settlement", "town")
-    log.info("the %s has %s streets%s%s; placed: %s", place, plan.pattern, by_seed, water, counts_text(counts))
+    size = " x ".join(f"{side_m:.0f} m" for side_m in town.size_m)
+    log.info(
+        "the %s of %s has %s streets%s%s; placed: %s", place, size, plan.pattern, by_seed, water, counts_text(counts)
+    )
     num_kept = 1 + len(town.placed)
     dropped = Counter(reason.replace(" ", "_") for _, reason in town.not_placed)
     tally = Tally(input=num_kept + len(town.not_placed), kept=num_kept, dropped=dropped)
