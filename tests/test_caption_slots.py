@@ -73,6 +73,9 @@ REFUSED = [
     ("en", "Turned {yaw@t2} to the {side:yaw}.", "same frames"),
     ("en", "It {trend:altitude} by {change:altitude} to the {side:offset_y@t0}.", "neither side"),
     ("en", "The gap has fallen by {change:distance}.", "is negative"),
+    # The decision is to the right, the offset to the left.
+    ("en", "The nose has to turn to the {side:decision}: the target is to its {side:offset_x}.", "no reason for"),
+    ("zh", "需要向{side:decision}转：目标在画面中心{side:offset_x}侧。", "no reason for"),
     ("zh", "距离减少了 {change:distance}。", "is negative"),
     ("zh", "目标不{visibility}。", "negate"),
     ("zh", "距离{trend:distanc}。", "table of facts"),

@@ -159,6 +159,8 @@ def fact_table(facts: Facts) -> str:
 
 _DIGITS = ("%.0f", "%.1f", "%.2f")  # by the number of digits after the point
 _NEITHER = ("straight", "centred")  # words of a side that say neither side
+# A side of these is a reason to turn to it; when the drone itself moves to the left, it may have to turn to the right.
+_TURN_REASONS = ("yaw", "offset_x", "bearing", "target_sideways_speed")
 _VOWEL = re.compile(r"[aeio]|8|1[18]\b")  # what begins with a vowel when it is spoken: eight, eleven, eighteen
 
 
@@ -170,8 +172,24 @@ class Filler:
 
     def fill(self, sentence: Sentence) -> str:
         """Return the plain text of a sentence; InvalidSlot: a fact is not known or does not fit."""
+        if self.decision.startswith("yaw_") and any(slot.name == "side:decision" for slot in sentence.slots):
+            self._check_reason(sentence)
         filled = sentence.pattern % tuple([self._write(slot) for slot in sentence.slots])
         return filled[0].upper() + filled[1:] if sentence.pattern.startswith("%s") else filled
+
+    def _check_reason(self, sentence: Sentence) -> None:
+        """Raise InvalidSlot if a sentence gives a fact to one side as the reason for a turn to the other."""
+        other = "left" if "right" in self.decision else "right"
+        for slot in sentence.slots:
+            reference = slot.reference  # one with a first frame may be of an earlier time
+            if (
+                reference
+                and reference.quantity in _TURN_REASONS
+                and (reference.aspect, reference.first) == ("side", None)
+            ):
+                fact = look_up(reference, self.facts)
+                if isinstance(fact, Fact) and fact.value == other:
+                    raise InvalidSlot(f"{{{slot.name}}} is {other} here, which is no reason for {self.decision}")
 
     def text_of(self, name: str) -> str:
         """Return how a slot with this name is filled in as a verb, or before what is compared; "" if not known."""

@@ -33,10 +33,10 @@ REASONS = {
     "conflict": "the decision is in conflict with the trajectory (see `verdict`), and it is not asked again",
     "no_label": "the decision is in conflict, and geometry has no label to anchor a regeneration to",
     "regeneration_failed": "the decision was in conflict, and no regenerated answer was accepted; see `checks.refused`",
-    "decision_mismatch": "the reasoning leads to another action than the decision",
+    "decision_mismatch": "the action that the model names after its reasoning is not the decision",
     "contradicted_value": "a number of the text contradicts the measured facts; see `checks.contradictions`",
-    "invalid_slot": "a slot names no known fact of the window, or its braces, unit or side do not fit; "
-    "try caption.writing=prose",
+    "invalid_slot": "a slot names no known fact of the window, its braces or unit do not fit, or its side is no reason "
+    "for the turn; try caption.writing=prose",
     "no_reason": "no observed fact supports a decision, or the label in a regeneration",
     "bilingual": "the two languages do not say the same; see `checks.bilingual`",
 }

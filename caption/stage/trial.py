@@ -121,6 +121,8 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
             fix = "raise it, or if the answers repeat themselves, use a larger model"
             yield f"fix: {num_cut} of {len(of_window)} answers were cut at {limit}; {fix}"
     num_accepted = sum(isinstance(outcome, Caption) and outcome.status == "accepted" for outcome in outcomes)
+    if not num_accepted:
+        yield "fix: no window was accepted; use a larger model, or one that was trained on such captions"
     yield f"=== {num_accepted} of {len(windows)} windows accepted, {sum(map(len, exchanges.values()))} answers ==="
 
 
