@@ -381,49 +381,34 @@ def test_bounds_crop_features_and_tables(tmp_path):
         BoxesConfig(bounds=(10, 0, 0, 10))
 
 
-def test_roofs_are_open_below_and_ponds_are_round(tmp_path):
-    circle = [list(map(list, Point(0, 0).buffer(15).exterior.coords))]
-    text = collection(
-        feature("Polygon", square(50, 0), building="roof", height="5"),
-        feature("Polygon", circle, natural="water"),
-    )
-    box_map = loaded(tmp_path, text, ".geojson", type_column="building,natural", units="m")
-    is_roof = box_map.kinds == KINDS["Buildings"]
-    assert_allclose([box_map.mins[is_roof, 2], box_map.maxs[is_roof, 2]], [[4.7], [5.0]], atol=1e-9)
-    water = union_all(footprints(box_map.select(~is_roof)))
-    assert water.symmetric_difference(Polygon(circle[0])).area < 0.05 * Polygon(circle[0]).area
-
-
-def test_surfaces_leave_water_open_and_buildings_their_passages(tmp_path, caplog):
+def test_streets_and_buildings_are_as_pedestrians_meet_them(tmp_path, caplog):
     caplog.set_level("INFO")
-    pond = [list(map(list, Point(30, 30).buffer(5).exterior.coords))]
-    house = [[[100, 0], [130, 0], [130, 30], [100, 30], [100, 0]]]
+    pond = Point(30, 30).buffer(5)
     text = collection(
-        feature("Polygon", [[[0, 0], [60, 0], [60, 60], [0, 60], [0, 0]]], highway="pedestrian", area="yes"),
-        feature("Polygon", pond, natural="water"),
-        feature("Polygon", house, building="yes"),
+        feature("Polygon", square(0, 0, 60), highway="pedestrian", area="yes"),
+        feature("Polygon", [list(map(list, pond.exterior.coords))], natural="water"),
+        feature("Polygon", square(100, 0, 30), building="yes"),
         feature("LineString", [[90, 15], [140, 15]], highway="footway", tunnel="building_passage"),
         feature("LineString", [[-50, -40], [50, -40]], waterway="stream", width="3"),
         feature("LineString", [[0, -80], [0, -20]], highway="service"),
-        feature("Polygon", [[[200, 0], [240, 0], [240, 40], [200, 40], [200, 0]]], natural="wood"),
-        feature("LineString", [[0, 70], [50, 70]], highway="residential", sidewalk="no", barrier="bollard"),
+        feature("Polygon", square(200, 0, 40), natural="wood"),
         feature("LineString", [[0, 90], [50, 90]], barrier="bollard"),
+        feature("Polygon", square(300, 0), building="roof", height="5"),
     )
     columns = {"type_column": "building,highway,natural,waterway,barrier", "units": "m"}
     box_map = loaded(tmp_path, text, ".json", **columns)  # as an editor may name it
-
-    def is_covered(kind: str, x: float, y: float) -> bool:
-        boxes = footprints(box_map)[box_map.kinds == KINDS[kind]]
-        return bool(union_all(boxes).contains(Point(x, y)))
-
-    assert is_covered("Water", 30, 30)
-    assert is_covered("Sidewalks", 10, 10)
-    assert not is_covered("Sidewalks", 30, 30)
-    assert is_covered("Buildings", 110, 5)
-    assert not is_covered("Buildings", 115, 15)
-    assert is_covered("Water", 20, -40)
-    assert not is_covered("Water", 0, -40)
+    areas = {
+        kind: union_all(footprints(box_map)[box_map.kinds == KINDS[kind]])
+        for kind in ("Sidewalks", "Water", "Buildings")
+    }
+    for kind, inside, outside in (("Sidewalks", (10, 10), (30, 30)), ("Water", (20, -40), (0, -40)),
+                                  ("Buildings", (110, 5), (115, 15))):  # fmt: skip
+        assert areas[kind].contains(Point(inside)), kind
+        assert not areas[kind].contains(Point(outside)), kind
+    assert areas["Water"].intersection(pond.buffer(5)).symmetric_difference(pond).area < 0.05 * pond.area
     assert np.count_nonzero(box_map.kinds == KINDS["Vegetation"]) == 25
+    is_roof = box_map.centers[:, 0] > 290
+    assert_allclose([box_map.mins[is_roof, 2], box_map.maxs[is_roof, 2]], [[4.7], [5.0]], atol=1e-9)
     assert "not used: barrier=bollard 1" in caplog.text
     with pytest.raises(InputError, match="Overpass's own JSON"):
         loaded(tmp_path, '{"version": 0.6, "elements": []}', ".json", **columns)
