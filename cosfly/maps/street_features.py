@@ -260,13 +260,14 @@ def _open_below_bridges(features: Sequence[Feature], added: Sequence[Feature]) -
     surfaces = [one for one in (*features, *added) if KINDS.get(one.kind) in GROUND_KINDS]
     bridges = shapely.union_all([one.area(BRIDGE_EDGE_M) for one in surfaces if one.is_bridge])
     streets = shapely.union_all([one.area(BRIDGE_EDGE_M) for one in surfaces if one.is_line])  # above culverts
+    openings = {False: bridges, True: shapely.union(bridges, streets)}  # by whether water is narrow
+    near = {key: opening.buffer(BRIDGE_NEAR_M, cap_style="flat") for key, opening in openings.items()}
     opened = list(features)
     for index, feature in enumerate(features):
-        opening = shapely.union(bridges, streets) if feature.value in NARROW_WATER else bridges
-        if feature.kind == "Water" and (area := feature.area()).intersects(opening):
-            near = opening.buffer(BRIDGE_NEAR_M, cap_style="flat")
-            water = area.difference(opening)
-            parts = [*polygons_of(water.intersection(near)), *polygons_of(water.difference(near))]
+        is_narrow = feature.value in NARROW_WATER
+        if feature.kind == "Water" and (area := feature.area()).intersects(openings[is_narrow]):
+            water = area.difference(openings[is_narrow])
+            parts = [*polygons_of(water.intersection(near[is_narrow])), *polygons_of(water.difference(near[is_narrow]))]
             opened[index] = feature._replace(shape=shapely.MultiPolygon(parts))
     return opened
 
