@@ -21,7 +21,7 @@ from cosfly.maps.unrealcv_export import UnrealCvMapConfig
 from cosfly.runtime.config import Config
 from cosfly.runtime.io import LinkedPath, write_bytes
 from cosfly.runtime.run_dir import StageFolder, Tally
-from cosfly.viz.topview import TopView, draw_map, png_bytes
+from cosfly.viz.topview import TopView, draw_map, draw_scale, png_bytes
 
 PICTURE_PX = 1200  # longer side of the overview picture
 
@@ -83,7 +83,10 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, follow_links: bool = False
         outputs.append(out / MESHES_FILE)
     if cfg.source == "unrealcv":
         outputs += unrealcv_export.write_objects(box_map, out)
-    write_bytes(out / "map.png", png_bytes(draw_map(box_map, TopView.around(np.stack(box_map.bounds()), PICTURE_PX))))
+    view = TopView.around(np.stack(box_map.bounds()), PICTURE_PX)
+    picture = draw_map(box_map, view)
+    draw_scale(picture, view)
+    write_bytes(out / "map.png", png_bytes(picture))
     dropped = box_map.header.dropped_objects
     num_objects = box_map.header.num_objects or len(box_map)
     tally = Tally(input=num_objects, kept=num_objects - sum(dropped.values()), dropped=dropped)

@@ -45,7 +45,7 @@ from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import StageFolder, result_of
 from cosfly.runtime.seeding import draw_by_share, rng_for
 from cosfly.runtime.worker import Item, Outcome, Work
-from cosfly.viz.topview import PAPER, TopView, add_caption, draw_dot, draw_line, png_bytes
+from cosfly.viz.topview import PAPER, TopView, add_caption, draw_dot, draw_line, draw_scale, png_bytes
 
 log = logging.getLogger(__name__)
 
@@ -297,6 +297,7 @@ def draw_overview(ground: WalkableGround, paths: list[PedestrianTrajectory]) -> 
         draw_dot(picture, line[0], 7, PAPER)
         draw_dot(picture, line[0], 7, color, thickness)
         draw_dot(picture, line[-1], 6, color)
+    draw_scale(picture, view)
     return png_bytes(add_caption(picture, f"{len(paths)} trajectories, a ring is a start; {CAPTION}"))
 
 

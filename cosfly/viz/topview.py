@@ -110,6 +110,15 @@ def draw_text(
     return left + width
 
 
+def draw_scale(picture: np.ndarray, view: TopView) -> None:
+    """Draw a bar of a round length at the lower left, at most a fifth of the width."""
+    most_m = picture.shape[1] / 5 / view.pixels_per_m
+    length_m = max(m for k in range(-2, 6) for m in (10**k, 2 * 10**k, 5 * 10**k) if m <= most_m)
+    bar = np.array([(12, picture.shape[0] - 12), (12 + length_m * view.pixels_per_m, picture.shape[0] - 12)])
+    draw_line(picture, bar, INK, 3, halo=7)
+    draw_text(picture, f"{length_m:g} m", 12, picture.shape[0] - 22, halo=HALO)
+
+
 def draw_labels(picture: np.ndarray, labels: Sequence[tuple[str, np.ndarray]]) -> None:
     """Write names at their places, (2,) px; a name that would cover another name or place is moved, with a line."""
     frame = shapely.box(0, 0, picture.shape[1], picture.shape[0])

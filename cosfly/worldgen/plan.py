@@ -14,6 +14,7 @@ from cosfly.runtime.json_io import Record, dump_json
 
 VERGE_M = 10.0  # of lawn around the town
 PATH_M = 4.0  # width of a footpath
+LEAST_FOOTPRINT_M = 6.0  # side of a building
 LEAST_INSIDE_M = 30.0  # side of a town without its edges, its river and its widest street
 
 
@@ -34,7 +35,7 @@ class Object(Record):
 
     name: str
     parts: tuple[ObjectPart, ...] = ()
-    where: Literal["open", "water", "bank", "quay", "layout"] = "open"
+    where: Literal["open", "green", "water", "bank", "quay", "layout"] = "open"
     words: tuple[str, ...] = ()
     asset: str | None = None
     least_scale: float = 1.0
@@ -75,7 +76,7 @@ def _within(values: Range, low: float, high: float) -> Range:
     return values
 
 
-Footprint = Annotated[Range, AfterValidator(partial(_within, low=6.0, high=120.0))]
+Footprint = Annotated[Range, AfterValidator(partial(_within, low=LEAST_FOOTPRINT_M, high=120.0))]
 Heights = Annotated[Range, AfterValidator(partial(_within, low=3.0, high=450.0))]
 Share = Annotated[Range, AfterValidator(partial(_within, low=0.0, high=0.8))]
 TreesPerHa = Annotated[Range, AfterValidator(partial(_within, low=0.0, high=400.0))]
@@ -119,7 +120,6 @@ class WorldPlan(BaseModel):
     only_these: bool = Field(False, description="there are no buildings but those of `buildings` and `objects`")
     footprint_m: Footprint = Field((12.0, 30.0), description="sides of other buildings")
     heights_m: Heights = Field((8.0, 24.0), description="heights of other buildings")
-    highest_m: float | None = Field(None, ge=3.0, le=450.0, description="no building is higher; null: no limit")
     building_share: Share = Field((0.0, 0.8), description="ground that buildings cover, of the town without water")
     gap_m: float = Field(3.0, ge=0.05, le=40.0, description="between neighbouring buildings")
     setback_m: float = Field(1.0, ge=0.0, le=15.0, description="from pavement to front; from 2.5 on there are gardens")

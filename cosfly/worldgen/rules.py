@@ -8,6 +8,7 @@ Source: an alternative to the language model of app:simworld:step1 where no endp
 
 import math
 import re
+from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 from cosfly.runtime.config import read_yaml
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.seeding import rng_for
-from cosfly.worldgen.plan import OBJECTS, PATH_M, WorldPlan
+from cosfly.worldgen.plan import LEAST_FOOTPRINT_M, OBJECTS, PATH_M, WorldPlan
 
 
 def _words(text: str) -> list[str]:
@@ -65,11 +66,6 @@ _HEIGHTS = {
     "at_least": rf"(?:at least|more than|over|above|minimum) {_HEIGHT}",  # "over 40 m tall"
     "exactly": _HEIGHT,  # "3-storey"
 }  # fmt: skip
-# "but the church", "but the church may be higher", not "but the square is paved"
-_EXCEPT = (
-    r"(?:except(?: for)?|other than|apart from"
-    r"|but(?= (?:the|an?)(?: (?!is|are|may|can)[\w-]+){1,3}(?:[,.]| $| (?:is|are|may be|can be) (?:higher|taller))))"
-)
 # Before a height of one building: "a 40 m tower", "a church whose tower is 30 m tall", "some of them 10 floors high"
 _OF_ONE = re.compile(
     r"(?:\b(?:an?|whose [\w-]+(?: [\w-]+)? (?:is|are)|(?:some|one|a few|\d+) of (?:them|which)(?: are| is)?)) $"
@@ -95,6 +91,85 @@ _CAN_BE_ABSENT = [
 ]  # fmt: skip
 _HAS_EFFECT = re.compile(rf"\b(?:{'|'.join(_longest_first(_CAN_BE_ABSENT))})(?:e?s|er|est)?\b")
 
+# Fields that an adjective changes, by target: what its noun stands for.
+FIELDS: dict[str, set[str]] = defaultdict(
+    lambda: {"footprint_m", "heights_m"},  # kinds of buildings
+    town={"blocks_along", "block_m", "gap_m", "heights_m", "street_m", "avenue_m", "trees_per_ha", "parked_share"},
+    street={"street_m", "avenue_m", "trees_per_ha", "parked_share"},
+    avenue={"avenue_m", "trees_per_ha", "parked_share"},
+    water={"river_m"},
+    other=set(),
+)
+OF_ANY = ("vegetation", "cars")  # groups of adjectives that describe the town, unless a noun follows
+ADJECTIVES = {
+    word: (group, choice)
+    for group, rows in WORDS["groups"].items() for choice, row in rows.items() for word in _words(row["words"])
+}  # fmt: skip
+SETTLEMENTS = {name: {*_words(row["words"])} for name, row in WORDS["settlements"].items()}
+SETTLEMENT_NOUNS = {*_words(WORDS["sized"])}.union(*SETTLEMENTS.values())
+# Nouns by target; later ones of a word replace earlier ones.
+NOUNS = {
+    **dict.fromkeys([*ORDINARY, *WORDS["open"], *_words(WORDS["lacking"])], "other"),
+    **dict.fromkeys(WORDS["water"], "water"),
+    **dict.fromkeys(_words(WORDS["streets"]), "street"),
+    **dict.fromkeys(_words(WORDS["avenues"]), "avenue"),
+    **{word: name for name, row in WORDS["buildings"].items() for word in (*_words(row["words"]), name)},
+    **{word: "other" for obj in OBJECTS.values() for word in (obj.name, *obj.words)},
+    **dict.fromkeys(SETTLEMENT_NOUNS, "town"),
+}
+_TOKEN = re.compile(
+    rf"(?P<end>[.,;:()]|(?<![\w-])(?:{'|'.join(_words(WORDS['ends']))})(?![\w-]))"
+    rf"|(?<![\w-])(?:(?P<known>{'|'.join(_longest_first([*ADJECTIVES, *NOUNS]))})(?:e?s)?|(?P<word>[\w-]+))(?![\w-])"
+)
+
+
+class _Phrase:
+    """The adjectives and nouns between two prepositions or punctuation marks."""
+
+    def __init__(self, end: str) -> None:
+        self.ends = [end]  # what is before it
+        self.adjectives = list[tuple[int, str]]()  # with their places in the text
+        self.nouns = list[str]()
+        self.words = set[str]()  # all others
+
+    @property
+    def head(self) -> str:
+        """The noun that the adjectives describe; empty if the phrase has none, "?" if it has an unknown one."""
+        return self.nouns[-1] if self.nouns else "" if self.words <= STOPS else "?"
+
+
+def _phrases(text: str) -> list[_Phrase]:
+    """Split a text into phrases."""
+    phrases = [_Phrase(".")]
+    for match in _TOKEN.finditer(text):
+        phrase = phrases[-1]
+        if match["end"] and not (phrase.adjectives or phrase.nouns or phrase.words):
+            phrase.ends.append(match["end"])
+        elif match["end"]:
+            phrases.append(_Phrase(match["end"]))
+        elif match["known"] in ADJECTIVES:
+            phrase.adjectives.append((match.start(), match["known"]))
+        elif match["known"]:
+            phrase.nouns.append(match["known"])
+        else:
+            phrase.words.add(match["word"])
+    return phrases
+
+
+def _nearby_noun(phrases: list[_Phrase], number: int) -> str:
+    """Return the noun for a phrase without one: "a small, dense | town", "houses are low | and narrow"."""
+    for after in phrases[number + 1 : number + 2]:
+        if after.nouns and {",", "and"}.issuperset(after.ends) and not {"a", "an", "the"} & after.words:
+            return after.head
+    return next((phrase.head for phrase in reversed(phrases[:number]) if phrase.nouns), "")
+
+
+def _target(group: str, noun: str) -> str:
+    """Return whose fields an adjective of a group changes with a noun."""
+    target = NOUNS.get(noun, "other") if noun else "town"
+    is_of_town = group == "density" and target in WORDS["buildings"]  # dense houses
+    return "town" if is_of_town else target
+
 
 def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
     """Read a prompt; return the plan, and the trace: what was read as what, and what was not respected.
@@ -117,11 +192,12 @@ def _normalized(prompt: str) -> str:
         # "a church whose tower": a part of it, which is not used
         (r"\1 steeple", r"\b((?:church|chapel|cathedral|castle)(?: (?!and\b)[\w-]+){1,4})(?<!clock)(?<!bell) tower\b"),
         ("industrial", r"\bindustrial (?:park|estate)\b"), (r"\1-park", r"\b(business|logistics) park\b"),
+        (r"\1public park", r"^((?:an? |the )?(?:[\w-]+ ){0,2})(?<!car )park\b"),  # not the one of "a city with a park"
         ("1-stor", r"\bsingle[- ]stor"), ("hotel-buildings", r"(?<!\d )\bhotels\b"),
         (r"apartment block\1", r"\bblock(s?) of flats\b"), ("apartments", r"\bflats\b"),
         (r"\1s of at most", r"\bthe (?:tallest|highest) (house|building)s? (?:is|are|has)\b"),
         # "no building except the church is higher than 12 m"
-        (r"except\2, \1 is", rf"\b((?:no|none|nothing)(?: \w+)?),? {_EXCEPT}((?: \w+){{1,4}}),? is\b"),
+        (r"\1 is", r"\b((?:no|none|nothing)(?: \w+)?),? (?:but|except|other than|apart from)(?: \w+){1,4},? is\b"),
     ):  # fmt: skip
         text = re.sub(pattern, plain, text)
     text = re.sub(r"\b([2-9]0)[- ]([1-9])\b", lambda match: str(int(match[1]) + int(match[2])), text)  # "20-5": 25
@@ -148,12 +224,12 @@ class _Reader:
         # What is read by `_take_phrases`.
         self.sizes: dict[str, re.Match[str]] = {}  # of the town, by name in _SIZES
         self.heights: dict[str, re.Match[str]] = {}  # of buildings, by name in _HEIGHTS
-        self.has_exception = False  # whether the limit of heights is not for all: "except the church"
         self.absent = ""  # what there is not, such as "towers, "
         self.objects: dict[str, int] = {}  # counts
         self.buildings: dict[str, int | None] = {}  # counts by kind; None for a plural without a number
         self.pattern: str | None = None  # of streets, if it is named
         self.named: str | None = None  # the settlement, if it is named
+        self.choices: dict[str, dict[str, str]] = {}  # of adjectives: target -> group -> choice
 
     def read(self, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
         """Return the plan and the trace."""
@@ -163,7 +239,8 @@ class _Reader:
         place = self.named or next(filter(None, implied), "town")
         settlement = WORDS["settlements"][place]
         self.plan |= {name: value for name, value in settlement.items() if name in self.plan}
-        choices = self._take_choices()
+        for target in ("town", "street", "avenue", "building"):
+            self._apply_choices(target, self.plan)
         has_open = self._take_open_and_water()
         towns = [WORDS["settlements"][name]["words"] for name in (place, "city", "town")]
         for words in (*towns, WORDS["patterns"].get(self.pattern, "")):
@@ -174,7 +251,7 @@ class _Reader:
             fix = "name a kind of place, or use a language model with --planner URL"
             raise InputError(what, where="PROMPT", got=repr(self.prompt[:60]), expected=expected, fix=fix)
         self.plan["pattern"] = self.pattern or settlement["patterns"][seed % len(settlement["patterns"])]
-        self._set_buildings(settlement, choices, has_open)
+        self._set_buildings(settlement, has_open)
         # The seed varies what settlement and choices set; then comes what the prompt measures, which does not vary.
         for name, factors in VARIED.items():
             self.plan[name] = _scaled(self.plan[name], rng_for(seed, "world", name).uniform(*factors))
@@ -192,7 +269,7 @@ class _Reader:
         trace = {
             "planner": "rules", "settlement": place, "settlement_is_named": bool(self.named or any(implied)),
             "pattern": plan.pattern, "pattern_is_named": self.pattern is not None,
-            "objects": self.objects, "without": self.absent, **choices,
+            "objects": self.objects, "without": self.absent, "choices": self.choices,
             "used": [words for words in self.used if words not in self.not_used],
             "not_used": plan.not_used, "not_respected": self.not_respected,
         }  # fmt: skip
@@ -223,7 +300,7 @@ class _Reader:
                 if meaning:
                     self.used[-1] = f"{match[0].strip()} ({meaning})"
 
-    def _take_counted(self, word: str, plural_count: int, *, needs_number: bool = False) -> int | None:
+    def _take_counted(self, word: str, plural_count: int, name: str = "", *, needs_number: bool = False) -> int | None:
         """Take a noun, not its adjectives; return its number, or None if the text does not hold it.
 
         A noun without a number counts 1, or `plural_count` in the plural.
@@ -235,7 +312,8 @@ class _Reader:
         match = self._take(rf"{number}\b({word}|{plural})\b(?!-)", keep=r", \2 ,")
         if match is None:
             return None
-        self.used.append(f"{match[1] or ''} {match[3]}".strip())
+        meaning = "" if name in match[3] else f" ({name})"
+        self.used.append(f"{match[1] or ''} {match[3]}{meaning}".strip())
         return int(match[1] or 0) or (1 if match[3] == word else plural_count)
 
     def _take_phrases(self) -> None:
@@ -249,7 +327,6 @@ class _Reader:
             self.heights["exactly"].string[: self.heights["exactly"].start()]
         ):
             self.not_used.append(self.heights.pop("exactly")[0].strip())
-        self.has_exception = bool(self.heights and self._take(rf"\b{_EXCEPT}\b"))
         limits = [name for name in self.heights if name != "at_least"]
         for name in limits[1:]:  # only the first limits the highest building
             self.not_used.append(self.heights.pop(name)[0].strip())
@@ -259,6 +336,7 @@ class _Reader:
             self.absent += f"{match[1].strip()}, "
             if not _HAS_EFFECT.search(match[1]):
                 self.not_used.append(match[0].strip())
+        self._take_adjectives()
         self.objects = self._take_objects()  # before buildings: a clock tower is no tower
         for word in _words(WORDS["lacking"]):  # before buildings: a control tower is none either
             if match := self._take(rf"(?:\b\d+ )?\b{word}s?\b"):
@@ -266,7 +344,6 @@ class _Reader:
         # Before buildings: a shanty is one, but a shanty town is a settlement. The words of both stay in the text until
         # all else is read, because other tables have them too: a harbour has water.
         self.pattern = next((name for name, words in WORDS["patterns"].items() if self._has(words)), None)
-        self.named = next((name for name, row in WORDS["settlements"].items() if self._has(row["words"])), None)
         self.buildings = self._take_buildings()
 
     def _take_objects(self) -> dict[str, int]:
@@ -275,7 +352,7 @@ class _Reader:
         names = {word: obj.name for obj in OBJECTS.values() for word in (obj.name, *obj.words)}
         for word in _longest_first(names):
             name = names[word]
-            while (count := self._take_counted(word, SEVERAL)) is not None:
+            while (count := self._take_counted(word, SEVERAL, name)) is not None:
                 counts[name] = self._within(f"number of {name}s", count, 1, 500)
         return dict(sorted(counts.items()))
 
@@ -285,37 +362,31 @@ class _Reader:
         counts: dict[str, int | None] = {}
         for word in _longest_first(names):
             name = names[word]
-            while (count := self._take_counted(word, 0, needs_number=name == "building")) is not None:
+            while (count := self._take_counted(word, 0, name, needs_number=name == "building")) is not None:
                 count += counts.get(name) or 0
                 counts[name] = self._within(f"number of {name}s", count, 1, 1000) if count else None
         return counts
 
-    def _take_choices(self) -> dict[str, str]:
-        """Take the choice of each group and apply it; words of size count only in phrases about the settlement."""
-        choices: dict[str, str] = {}
-        ends = "with|of|and|around|in|by|on|at|along|near|between|to|from|for|over|through"
-        phrases = re.split(rf"[.,;:()]|(?<![\w-])(?:{ends})(?![\w-])", self.text)
-        settlement = rf"\b(?:{'|'.join(_words(WORDS['sized']))})\b|-scale"
-        about_settlement = [phrase for phrase in phrases if re.search(settlement, phrase)]
-        for group, rows in WORDS["groups"].items():
-            text = " , ".join(about_settlement if group == "size" else phrases)
-            word_of: dict[str, str] = {}  # the last word of each choice in the text
-            for choice, row in rows.items():
-                for word in _words(row["words"]):
-                    if re.search(rf"(?<![\w-]){word}(?![\w-])", text):
-                        word_of[choice] = word
-            if len(word_of) > 1:
-                got = " and ".join(repr(word) for word in word_of.values())
-                what = f"two words about {group} contradict each other"
-                raise InputError(what, where="PROMPT", got=got, fix="use only one of these words")
-            for choice in word_of:
-                choices[group] = choice
-                self._take_words(rows[choice]["words"], group)
-        for group, choice in choices.items():
-            for name, factor in WORDS["groups"][group][choice].items():
-                if name != "words":
-                    self.plan[name] = _scaled(self.plan[name], factor)
-        return choices
+    def _take_adjectives(self) -> None:
+        """Take the adjectives that change what their noun stands for; set their choices and the named settlement."""
+        phrases = _phrases(self.text)
+        for phrase in phrases:
+            if not self.named and phrase.head in SETTLEMENT_NOUNS:
+                self.named = next((name for name, words in SETTLEMENTS.items() if words & {*phrase.nouns}), None)
+        taken = list[tuple[int, int]]()
+        for number, phrase in enumerate(phrases):
+            for start, word in phrase.adjectives:
+                group, choice = ADJECTIVES[word]
+                noun = phrase.head or ("" if group in OF_ANY else _nearby_noun(phrases, number))
+                target = _target(group, noun)
+                chosen = self.choices.setdefault(target, {})
+                if FIELDS[target].isdisjoint(WORDS["groups"][group][choice]) or chosen.get(group, choice) != choice:
+                    continue  # it stays in the text, and so among the words that are not used
+                chosen[group] = choice
+                self.used.append(f"{word} ({group if target == 'town' else noun})")
+                taken.append((start, start + len(word)))
+        for start, end in reversed(taken):
+            self.text = self.text[:start] + self.text[end:].removeprefix(" ")  # "30 small houses" are 30 houses
 
     def _take_open_and_water(self) -> bool:
         """Take words of open blocks and of water, and set both; return whether open blocks are named."""
@@ -324,6 +395,7 @@ class _Reader:
         for word, width_m in WORDS["water"].items():
             if self._has(word):
                 self.plan["river_m"] = width_m
+        self._apply_choices("water", self.plan)
         for word, field in WORDS["open"].items():
             if re.search(rf"(?:^|, ){word}s?, ", self.absent):
                 self.plan[field] = 0
@@ -367,22 +439,33 @@ class _Reader:
 
     # --- fields of the plan ---
 
-    def _set_buildings(self, settlement: dict[str, Any], choices: dict[str, str], has_open: bool) -> None:
+    def _apply_choices(self, target: str, fields: dict[str, Any]) -> None:
+        """Multiply the fields of a target by the factors of its adjectives."""
+        for group, choice in self.choices.get(target, {}).items():
+            for name, factor in WORDS["groups"][group][choice].items():
+                if name in FIELDS[target] and name in fields:
+                    fields[name] = _scaled(fields[name], factor)
+
+    def _set_buildings(self, settlement: dict[str, Any], has_open: bool) -> None:
         """Set the kinds of buildings. Where one that the settlement consists of is counted, there are no others."""
-        factor = WORDS["groups"]["height"].get(choices.get("height"), {}).get("heights_m", 1.0)
         counts = [count for count in self.buildings.values() if count is not None]
-        is_whole = sum(counts) >= FEW or any(f" of {count} " in self.normalized for count in counts)
+        is_of_them = any(f" of {count} " in self.normalized for count in counts)
         for name, count in self.buildings.items():
             row = WORDS["buildings"][name]
             footprint_m = row.get("footprint_m", self.plan["footprint_m"])
-            heights_m = _scaled(row["heights_m"], factor) if "heights_m" in row else self.plan["heights_m"]
+            group = {"name": name, "count": count, "footprint_m": footprint_m, "heights_m": self.plan["heights_m"]}
+            if "heights_m" in row:
+                group["heights_m"] = row["heights_m"]
+                self._apply_choices("town", group)
+            if name != "building":  # whose adjectives are those of all buildings
+                self._apply_choices(name, group)
+                group["footprint_m"] = tuple(max(side_m, LEAST_FOOTPRINT_M) for side_m in group["footprint_m"])
             if count is None and "gap_m" in row:
                 self.plan["gap_m"] = row["gap_m"]
-            group = {"name": name, "count": count, "footprint_m": footprint_m, "heights_m": heights_m}
             self.plan["buildings"].append(group)
             is_main = not row.get("landmark") or name in _words(settlement.get("consists_of", ""))
-            if None not in self.buildings.values() and is_main:
-                self.plan["only_these"] = is_whole
+            if None not in self.buildings.values() and (is_of_them or (is_main and sum(counts) >= FEW)):
+                self.plan["only_these"] = True
         if self.plan["only_these"] and not has_open:
             self.plan |= {"plazas": 0, "greens": 0}
 
@@ -408,15 +491,6 @@ class _Reader:
             got = " ".join(match[0].strip() for match in self.heights.values())
             expected = "a lowest height below the highest, both within 3 to 450 m"
             raise InputError("the range of building heights is impossible", where="PROMPT", got=got, expected=expected)
-        rows = [row for name, row in WORDS["buildings"].items() if name != "building"]
-        kinds = "|".join(word for row in rows for word in _words(row["words"]))
-        before = rf"\b(?:{kinds})(?:e?s)?(?: ?,)?(?: (?:of|with|are))? ?$"
-        is_of_a_kind = any(
-            re.search(before, match.string[: match.start()]) and not match[0].startswith(("no", "none"))
-            for match in self.heights.values()
-        )
-        is_of_some = is_of_a_kind or self.has_exception
-        self.plan["highest_m"] = None if is_of_some else high_m  # "houses, at most 3 floors high" limit no lighthouse
         for group in (self.plan, *self.plan["buildings"]):
             group["heights_m"] = _limited(group["heights_m"], low_m, high_m, is_replaced="between" in self.heights)
 
@@ -458,7 +532,7 @@ def _limited(heights_m: Any, low_m: float, high_m: float | None, *, is_replaced:
         most_m = high_m if is_replaced else min(most_m, high_m)
         least_m = max(low_m, min(least_m, 0.6 * most_m), LOWEST_M)  # 0.6: they differ below an upper limit too
         most_m = max(most_m, least_m)
-    return min(least_m, HIGHEST_M), min(most_m, HIGHEST_M)
+    return round(min(least_m, HIGHEST_M), 2), round(min(most_m, HIGHEST_M), 2)
 
 
 def _metres(unit: str) -> float:

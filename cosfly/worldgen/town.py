@@ -147,6 +147,10 @@ class Town:
         self._objects = BoxList()
         self._taken = list[BaseGeometry]()  # outlines of buildings and objects
         self._outline = shapely.box(-size_m[0] / 2, -size_m[1] / 2, size_m[0] / 2, size_m[1] / 2)
+        # Of the open blocks; one is paved for objects if none is planned, except among gardens.
+        has_objects = any(obj.where in ("open", "green", "quay") for obj, _ in plan.known_objects())
+        self.num_open = max(plan.plazas + plan.greens, int(has_objects))
+        self.num_plazas = plan.plazas or int(self.num_open > plan.greens and plan.setback_m < GARDEN_SETBACK_M)
         self.network = network(plan, size_m, rng_for(seed, "world", "streets"))
         self._strips = self._lay_streets()  # outlines of streets, from front to front
         # A millimetre wider, because rounding leaves gaps between strips that touch.
@@ -203,25 +207,22 @@ class Town:
         return shapely.intersection(inside, shapely.box(2.0 + low_x, low_y, high_x - 2.0, high_y - 2.0))
 
     def _choose_open_blocks(self) -> list[Polygon]:
-        """Return plazas, the blocks nearest to the middle, then greens; one if only an object needs it."""
+        """Return plazas, the blocks nearest to the middle, then greens."""
         plan = self.plan
         rng = rng_for(self.seed, "world", "open")
-        has_objects = any(obj.where in ("open", "quay") for obj, _ in plan.known_objects())
-        num_open = max(plan.plazas + plan.greens, int(has_objects))
         blocks = self._closed_blocks[: max(1, len(self._closed_blocks) // 2)]
-        num_plazas = plan.plazas or int(has_objects and not plan.greens)
-        rest = blocks[num_plazas:]
-        chosen = blocks[:num_plazas] + [rest[k] for k in rng.permutation(len(rest))]
-        if len(chosen) < num_open:  # open lots along streets
+        rest = blocks[self.num_plazas :]
+        chosen = blocks[: self.num_plazas] + [rest[k] for k in rng.permutation(len(rest))]
+        if len(chosen) < self.num_open:  # open lots along streets
             lots = self._lots([(0.7 * plan.block_m,) * 2], rng, setback_m=0.0)
-            chosen += [rectangle_polygon(lot) for lot in islice(lots, num_open - len(chosen))]
-        return chosen[:num_open]
+            chosen += [rectangle_polygon(lot) for lot in islice(lots, self.num_open - len(chosen))]
+        return chosen[: self.num_open]
 
     def _pave_open_blocks(self) -> list[BaseGeometry]:
         """Pave the plazas, and two paths that cross each green; return the paved areas."""
-        paved: list[BaseGeometry] = [*self.open_blocks[: self.plan.plazas]]
+        paved: list[BaseGeometry] = [*self.open_blocks[: self.num_plazas]]
         whole = (-0.6, 0.6)  # shares of a side: a little more than the green
-        for green in self.open_blocks[self.plan.plazas :]:
+        for green in self.open_blocks[self.num_plazas :]:
             shape = oriented_rectangle(green)
             along, across = ((-PATH_HALF_M / side, PATH_HALF_M / side) for side in shape.size)
             for path in (rectangle_polygon(shape, along, whole), rectangle_polygon(shape, whole, across)):
@@ -314,7 +315,7 @@ class Town:
         for number in range(count):
             scaled_place = self._find_place(obj, scales)
             if scaled_place is None:
-                may_exist = obj.where in ("open", "quay") or not self.network.water.is_empty
+                may_exist = obj.where in ("open", "green", "quay") or not self.network.water.is_empty
                 self.not_placed.append((obj.name, "no room" if may_exist else "no water in the plan"))
                 continue
             place, scale = scaled_place
@@ -338,11 +339,13 @@ class Town:
             if obj.where == "water":
                 return self._place_in(obj, water, scales, 0.0)
             return self._place_at_bank(obj, water)
-        roomy = [block for block in self.open_blocks if math.prod(obj.size_m) < MOST_OF_BLOCK * block.area]
+        plazas, greens = self.open_blocks[: self.num_plazas], self.open_blocks[self.num_plazas :]
+        blocks = greens + plazas if obj.where == "green" else self.open_blocks
+        roomy = [block for block in blocks if math.prod(obj.size_m) < MOST_OF_BLOCK * block.area]
         return (
             self._place_in_blocks(obj, roomy, scales)
             or self._place_on_lot(obj, scales)
-            or self._place_in_blocks(obj, self.open_blocks, scales)
+            or self._place_in_blocks(obj, blocks, scales)
         )
 
     def _place_in_blocks(
@@ -392,7 +395,7 @@ class Town:
         centers = np.stack([x.ravel(), y.ravel()], axis=1)
         away_m = np.hypot(*(centers - np.array(turned.centroid.coords[0])).T)
         x, y = centers[np.argsort(away_m, kind="stable")].T
-        turns_deg = (0.0, 90.0) if obj.where == "open" else (0.0,)
+        turns_deg = (0.0, 90.0) if obj.where in ("open", "green") else (0.0,)
         for scale in scales:
             wide, deep = (side * scale for side in obj.size_m)
             for turn_deg in turns_deg:
@@ -426,7 +429,7 @@ class Town:
         is_ground = of_kinds(world, "Roads", "Terrain", "RoadLines") | (world.maxs[:, 2] <= 0.0)
         is_path = of_kinds(world, "Sidewalks") & ((2 * world.half_extents[:, :2]).min(1) < 5.0)
         obstacles = shapely.STRtree([*footprints(world)[~is_ground | is_path], *self._taken])  # and pitches
-        ground = shapely.difference(self._blocks, shapely.union_all(self.open_blocks[: self.plan.plazas]))
+        ground = shapely.difference(self._blocks, shapely.union_all(self.open_blocks[: self.num_plazas]))
         shapely.prepare(ground)
         low_x, low_y, high_x, high_y = ground.bounds
         for xy in rng.uniform((low_x, low_y), (high_x, high_y), (40 * count, 2)):
