@@ -18,10 +18,11 @@ from caption.stage.tracks import TrackInput
 from caption.stage.window_loop import caption_window
 from caption.teachers.judge import Judge, open_judge
 from caption.teachers.prompt_files import Vocabulary
-from caption.teachers.teacher import Teacher, open_teacher
+from caption.teachers.teacher import AskingTeacher, Teacher, open_teacher
 from cosfly.formats.captions import Caption, Usage, read_captions, write_captions
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook, Budget, BudgetSpent
+from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import STOP_AFTER_FAILURES, NoAnswer
 from cosfly.runtime.console import SECONDS_BETWEEN_LINES, Advance, duration, progress_bar
 from cosfly.runtime.errors import CosflyError, InputError, TeacherError, counts_text
@@ -32,8 +33,9 @@ log = logging.getLogger(__name__)
 ANSWERS, JUDGEMENTS = "answers", "judgements"  # folders
 QUARANTINE, FAILURES = "quarantine.jsonl", "failures.jsonl"
 NOT_ASKED = "not_asked"  # the code of windows that this run does not ask about
-# Windows beyond `concurrency`, so that pictures are encoded and answers checked while others are asked.
+# Most windows beyond the requests at once, so that pictures are encoded and answers checked while others are asked.
 WAITING_WINDOWS = 16
+ANSWERS_PER_WINDOW = 2  # English and Chinese, until windows are finished
 
 
 @dataclass
@@ -75,8 +77,8 @@ class Asking:
         self.retried = frozenset(self.quarantine) if retry_failed else frozenset[str]()
         self.retried_tracks = {flight_of(sample_id) for sample_id in self.retried}
         self.num_judging = cfg.judge.concurrency if cfg.judge.url else 0
-        # One slot for each window in work. A window has one request in flight, to the teacher or to the judge.
-        self.slots = asyncio.Semaphore(max(cfg.most_in_flight, self.num_judging) + WAITING_WINDOWS)
+        self.num_in_work = 0  # windows; each has one request in flight, to the teacher or to the judge
+        self.window_is_done = asyncio.Event()
         self.begun: dict[TrackInput, list[asyncio.Task[Caption | None]]] = {}  # the windows of tracks in work
         self.num_failed_in_row = 0
         self.has_accepted = False  # a caption, in this run or an earlier one
@@ -95,12 +97,17 @@ class Asking:
                 most_in_flight = self.cfg.most_in_flight + self.num_judging
                 budget = Budget(self.cfg.budget, most_in_flight, answers.totals, judgements.totals)
                 with progress_bar("caption", sum(guesses)) as advance:
-                    self.progress = RunProgress(advance, sum(guesses), budget)
                     async with (
                         open_teacher(self.cfg, answers, self.seed, budget, self.retried) as teacher,
                         open_judge(self.cfg.judge, self.vocabulary, self.seed, judgements, budget) as judge,
                     ):
                         self.teacher, self.judge = teacher, judge
+                        self.progress = RunProgress(advance, sum(guesses), budget)
+                        if self.cfg.most_in_flight == 1 and (num_answers := answers.totals["answers"]):
+                            answer_s = answers.latency_s / num_answers
+                            all_s = duration(answer_s * ANSWERS_PER_WINDOW * sum(guesses))
+                            words = "caption: an answer took %.1f s so far: about %s for %d windows of 2 answers"
+                            log.info(words, answer_s, all_s, sum(guesses))
                         await self._ask_all(tracks, guesses)
                 if self.progress.windows.input:
                     log.info("caption: %s", self.progress.figures())
@@ -158,11 +165,13 @@ class Asking:
         is_cut = False
         try:
             for window in track.windows(self.cfg):
-                await self.slots.acquire()
+                while self.num_in_work >= self._most_in_work():
+                    self.window_is_done.clear()
+                    await self.window_is_done.wait()
                 if self.outcome.stopped:
-                    self.slots.release()
                     is_cut = True
                     break
+                self.num_in_work += 1
                 windows.append(tasks.create_task(self._ask_window(window)))
         except InputError as error:
             del self.begun[track]
@@ -175,6 +184,14 @@ class Asking:
             tally.kept -= 1
             tally.dropped["too_short"] += 1
         tasks.create_task(self._write_track(track, is_cut))
+
+    def _most_in_work(self) -> int:
+        """Return how many windows may be in work: about twice the requests at once, so that a slow server finishes
+        windows early instead of giving the first answers of many."""
+        num_at_once = self.cfg.most_in_flight if isinstance(self.teacher, AskingTeacher) else self.num_judging
+        if isinstance(self.teacher, AskingTeacher) and isinstance(self.teacher.kept.engine, ChatClient):
+            num_at_once = int(self.teacher.kept.engine.concurrency.limit)
+        return num_at_once + min(num_at_once, WAITING_WINDOWS)
 
     async def _write_track(self, track: TrackInput, is_cut: bool) -> None:
         """Write the part of a track after its last window, or its gap if a window has no answer."""
@@ -219,7 +236,8 @@ class Asking:
             self.progress.add(caption)
             return caption
         finally:
-            self.slots.release()
+            self.num_in_work -= 1
+            self.window_is_done.set()
         return None
 
     def _record_unanswered(self, failure: Failed) -> None:
@@ -283,8 +301,7 @@ class RunProgress:
         self.budget = budget
         self.windows = Tally()  # of this run
         self.num_repaired = 0
-        self._num_recorded = 0  # windows of this run before its first new answer: earlier answers sufficed
-        self._num_used = 0  # answers of the other windows of this run
+        self._num_answered = self._num_used = 0  # windows of this run with a caption, and their answers, old and new
         self._start_s = self._answered_s = time.monotonic()
         self._num_answers = 0
         self._totals_before = budget.totals
@@ -298,10 +315,9 @@ class RunProgress:
         """Count a caption, None for a window without an answer."""
         self.num_left -= 1
         self.windows.input += 1
-        if not self._answers["answers"]:
-            self._num_recorded += 1
-        elif caption is not None:
-            self._num_used += caption.attempts
+        if caption is not None:
+            self._num_answered += 1
+            self._num_used += caption.attempts + (caption.judge is not None)
         if caption is None or caption.drop_reason == "refused":
             self.windows.failed["no_answer"] += 1
         elif caption.status == "accepted":
@@ -330,7 +346,7 @@ class RunProgress:
         """Return the figures of the run as a text."""
         prices, windows, answers = self.budget.cfg, self.windows, self._answers
         reasons = ", ".join(f"{reason} {count}" for reason, count in windows.dropped.most_common(4))
-        elapsed_s = max(time.monotonic() - self._start_s, 1e-9)
+        elapsed_s = time.monotonic() - self._start_s
         figures = [
             f"accepted {windows.kept:,} (repaired {self.num_repaired:,})",
             f"dropped {windows.dropped.total():,}" + (f" ({reasons})" if reasons else ""),
@@ -342,11 +358,9 @@ class RunProgress:
             figures.append(f"cut at max_tokens {answers['cut']:,}")
         if prices.price_prompt or prices.price_completion:
             figures.append(f"cost {prices.cost(answers['prompt_tokens'], answers['completion_tokens']):.2f}")
-        if num_asked := windows.input - self._num_recorded:
-            # English answers come first, so some windows that are not finished have part of their answers.
-            per_window = max(self._num_used, num_asked) / num_asked
-            num_begun = min(max(0.0, answers["answers"] - self._num_used) / per_window, WAITING_WINDOWS, self.num_left)
-            rate = (num_asked + num_begun) / elapsed_s
-            figures.append(f"{1 / rate:.0f} s per window" if rate < 1.0 else f"{rate:.1f} windows/s")
-            figures.append(f"{duration((self.num_left - num_begun) / rate)} left")
+        if answers["answers"]:  # without those of earlier runs, which take no time
+            per_window = self._num_used / self._num_answered if self._num_used else ANSWERS_PER_WINDOW
+            window_s = max(self._answered_s - self._start_s, 1e-9) / answers["answers"] * per_window
+            figures.append(f"{window_s:.0f} s per window" if window_s > 1.0 else f"{1 / window_s:.1f} windows/s")
+            figures.append(f"about {duration(self.num_left * window_s)} left")
         return ", ".join(figures)

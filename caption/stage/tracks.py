@@ -5,7 +5,9 @@ does not count as finished under another limit; one with an unanswered window is
 removed when nothing can be added to the product.
 """
 
+import contextlib
 import logging
+from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -25,14 +27,14 @@ PARTS = "parts"
 
 @dataclass(frozen=True)
 class TrackInput:
-    """A track to caption. max_windows: The first windows that a limit allows; None for all."""
+    """A track to caption. chosen: Numbers of the windows that a limit allows; None for all."""
 
     name: str
     folder: Path
-    max_windows: int | None = None
+    chosen: frozenset[int] | None = None
 
     def part(self, stage_path: Path) -> Path:
-        end = ".jsonl" if self.max_windows is None else f".{self.max_windows}.cut"
+        end = ".jsonl" if self.chosen is None else f".{len(self.chosen)}.cut"  # a larger limit adds windows
         return stage_path / PARTS / f"{self.name}{end}"
 
     def gap(self, stage_path: Path) -> Path:
@@ -40,7 +42,7 @@ class TrackInput:
 
     @property
     def item_id(self) -> str:
-        return self.name if self.max_windows is None else f"{self.name}[:{self.max_windows}]"
+        return self.name if self.chosen is None else f"{self.name}[{len(self.chosen)}]"
 
     def windows(self, cfg: CaptionConfig) -> Iterator[Window]:
         """Yield the windows in order of time; InputError if the track or its clean twin cannot be read."""
@@ -50,40 +52,45 @@ class TrackInput:
         except VerifyError as error:  # it has other frames
             log.warning("caption: %s: the labels do not use the clean track: %s", track.flight_id, error)
             twin = None
-        return islice(cut_windows(track, cfg.window, twin), self.max_windows)
+        windows = enumerate(cut_windows(track, cfg.window, twin))
+        return (window for number, window in windows if self.chosen is None or number in self.chosen)
 
     def guess_num_windows(self, cfg: WindowConfig) -> int:
-        """Estimate the number of windows from the frame folders, without reading the track."""
+        """Estimate the number of windows from the frame folders, without reading the track if it has any."""
         num_frames = sum(1 for _ in (self.folder / "frames_playback").glob("frame_*"))
-        count = len(current_frames(num_frames, cfg))
-        return count if self.max_windows is None else min(count, self.max_windows)
+        if not num_frames:
+            with contextlib.suppress(InputError):  # the run itself records the failure
+                num_frames = len(read_track(self.folder))
+        return len(current_frames(num_frames, cfg)) if self.chosen is None else len(self.chosen)
+
+
+def spread(total: int, count: int) -> list[int]:
+    """Return `count` numbers below `total`, spread evenly (van der Corput); a larger count only adds to a smaller."""
+    bits = total.bit_length()
+    numbers = (int(f"{i:0{bits}b}"[::-1], 2) * total >> bits for i in range(1 << bits))
+    return sorted(islice(dict.fromkeys(numbers), count))
 
 
 def find_inputs(cfg: CaptionConfig, data: Path) -> tuple[list[TrackInput], bool]:
     """Return the tracks of a run in the order of the product, and whether the limit of the settings cuts them.
 
-    The windows that a limit allows do not depend on the order of work.
+    A limit takes windows spread over all tracks. They do not depend on the order of work.
     """
     folders = find_tracks(data, cfg.flights)
     ids = flight_ids([place_of(folder) for folder in folders])
     tracks = [TrackInput(ids[place_of(folder)], folder) for folder in folders]
     tracks.sort(key=lambda track: f"{track.name}_frame_")  # the order of the sample ids
-    if cfg.limit is None:
+    counts = [track.guess_num_windows(cfg.window) for track in tracks]
+    if cfg.limit is None or cfg.limit >= sum(counts):
         return tracks, False
-    left = cfg.limit
-    inputs: list[TrackInput] = []
-    for track in tracks:
-        try:
-            count = sum(1 for _ in track.windows(cfg))
-        except InputError:
-            count = 0  # the run itself records the failure
-        if count > left:
-            if left:
-                inputs.append(replace(track, max_windows=left))
-            return inputs, True
-        inputs.append(track)
-        left -= count
-    return inputs, False
+    numbers, inputs, begin = spread(sum(counts), cfg.limit), [], 0
+    for track, count in zip(tracks, counts, strict=True):
+        of_track = numbers[bisect_left(numbers, begin) : bisect_left(numbers, begin + count)]
+        if of_track:
+            chosen = None if len(of_track) == count else frozenset(number - begin for number in of_track)
+            inputs.append(replace(track, chosen=chosen))
+        begin += count
+    return inputs, True
 
 
 def parts_of(stage_path: Path, tracks: Sequence[TrackInput]) -> list[Path]:

@@ -1,15 +1,12 @@
 """`--try`: a few windows before a run, with all that is asked and answered.
 
-The windows are real ones, spread over the tracks. Their answers stay in the journal, so the run does not ask for them
-again.
+The windows are those of `--limit`. Their answers stay in the journal, so the run does not ask for them again.
 """
 
 import asyncio
 import logging
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
 
 from caption.schema import CaptionConfig
@@ -71,13 +68,11 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
     if open_stage(cfg, data, out, seed).is_complete:
         what, fix = "the directory is complete, so no window is left to try", "choose another --out"
         raise InputError(what, where=out, fix=fix)
-    tracks, _ = find_inputs(cfg, data)
-    unfinished = [track for track in tracks if track.guess_num_windows(cfg.window) and not track.part(out).exists()]
-    if not unfinished:
-        raise InputError("all tracks are captioned or too short", where=data, got=f"{len(tracks)} tracks")
-    # Spread over the tracks; several windows of one track if there are fewer tracks than windows.
-    num_of_track = Counter(unfinished[number * len(unfinished) // num_windows] for number in range(num_windows))
-    windows = [window for track, count in num_of_track.items() for window in islice(track.windows(cfg), count)]
+    limit = min(num_windows, cfg.limit or num_windows)  # windows of which any larger limit reuses the answers
+    tracks, _ = find_inputs(cfg.model_copy(update={"limit": limit}), data)
+    windows = [window for track in tracks for window in track.windows(cfg)]
+    if not windows:
+        raise InputError("all tracks are too short", where=data, got=f"{len(tracks)} tracks")
     exchanges: dict[str, list[tuple[Request, Reply]]] = {window.observed.sample_id: [] for window in windows}
 
     async def ask(advance: Advance) -> list[Caption | BaseException]:

@@ -86,6 +86,7 @@ class AnswerBook:
         """Count the answers of earlier runs."""
         self.folder = folder
         self.totals: Counter[str] = Counter()  # answers, prompt_tokens, completion_tokens of all runs into this folder
+        self.latency_s = 0.0  # of all these answers
         for path in sorted(folder.glob("*.jsonl")):
             for answer in Journal(path).read_as(Answer.model_validate):
                 self._count(answer)
@@ -147,6 +148,7 @@ class AnswerBook:
 
     def _count(self, answer: Answer) -> None:
         self.totals["answers"] += 1
+        self.latency_s += answer.latency_s
         if answer.finish_reason == "length":
             self.totals["cut"] += 1
         self.totals.update(answer.usage)
