@@ -38,7 +38,7 @@ def test_what_a_template_becomes():
         ("en", "The height {trend:altitude} by {change:altitude}.", "The height increases by 2.0 m."),
         ("en", "The box measures {box@t4} now, {box@t0} then.", "The box measures 36 x 72 px now, 30 x 60 px then."),
         ("en", "The box {trend:box_height} by {growth:box_height}.", "The box increases by 20%."),
-        ("en", "It was {visibility@t3} at t3.", "It was occluded at t3."),
+        ("en", "It was {visibility@t3}, falling behind by {change:altitude}.", "It was occluded, falling behind by 2.0 m."),
         ("en", "The drone is {comparison:speed} the walker.", "The drone is faster than the walker."),
         ("en", "The drone is {comparison:speed}.", "The drone is faster."),
         ("en", "The gap is {distance} m wide.", "The gap is 18.0 m wide."),  # the unit once
@@ -77,6 +77,8 @@ REFUSED = [
     ("en", "The nose has to turn to the {side:decision}: the target is to its {side:offset_x}.", "no reason for"),
     ("zh", "需要向{side:decision}转：目标在画面中心{side:offset_x}侧。", "no reason for"),
     ("zh", "距离减少了 {change:distance}。", "is negative"),
+    ("en", "The drone is descending slowly at {climb_rate}.", "contradicts"),
+    ("zh", "间距在扩大，速度为 {altitude}；高度下降 {change:altitude}。", "contradicts"),
     ("zh", "目标不{visibility}。", "negate"),
     ("zh", "距离{trend:distanc}。", "table of facts"),
     ("zh", "速度为 {speed} 米。", "米/秒"),
@@ -146,7 +148,7 @@ def writing_server(english: str, corrected: str | None = None) -> TeacherServer:
 
 def test_a_record_holds_the_plain_text_and_the_template(tree, tmp_path):
     with writing_server("The gap of {distance} calls for this decision.") as server:
-        captions = list(read_captions(run(settings(server.url, limit=2), tree, tmp_path / "out")))
+        captions = list(read_captions(run(settings(server.url, limit=1), tree, tmp_path / "out")))
     for caption in captions:
         assert caption.writing == "slots"
         assert caption.slots["en"].reasoning_trace == "The gap of {distance} calls for this decision."
@@ -159,12 +161,12 @@ def test_a_record_holds_the_plain_text_and_the_template(tree, tmp_path):
 
 def test_a_contradicted_value_is_asked_for_again_with_the_measured_ones(tree, tmp_path):
     with writing_server("The gap of 47.5 m calls for it.", "The gap of {distance} calls for it.") as server:
-        captions = list(read_captions(run(settings(server.url, limit=2), tree, tmp_path / "out")))
-    assert [caption.checks.refused for caption in captions] == [["contradicted_value"]] * 2
-    assert [caption.checks.contradictions for caption in captions] == [None] * 2
+        captions = list(read_captions(run(settings(server.url, limit=1), tree, tmp_path / "out")))
+    assert [caption.checks.refused for caption in captions] == [["contradicted_value"]]
+    assert [caption.checks.contradictions for caption in captions] == [None]
     corrections = [json.loads(body)["messages"][-1]["content"] for body in server.bodies]
     complaints = [content[0]["text"] for content in corrections if isinstance(content, list) and len(content) == 1]
-    assert len(complaints) == 2
+    assert len(complaints) == 1
     assert all('"47.5 m"' in text and "horizontal distance: " in text for text in complaints)
 
 
@@ -201,7 +203,7 @@ def test_the_question_shows_what_is_known_by_its_slot(tree, tmp_path):
     # Not known.
     assert "heading}" not in table.replace("{side:target_heading}", "").replace("{change:target_heading}", "")
     with writing_server("The gap of {distance} calls for nothing.") as server:
-        run(settings(server.url, limit=2), tree, tmp_path / "out")
+        run(settings(server.url, limit=1), tree, tmp_path / "out")
     questions = [body["messages"] for body in map(json.loads, server.bodies) if not is_mirror(body)]
     assert all("{distance@t0} to {distance@t4}: " in user["content"][-1]["text"] for _, user in questions)
     assert len({system["content"] for system, _ in questions}) == 1  # a constant prefix

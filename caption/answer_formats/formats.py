@@ -214,6 +214,8 @@ class Filler:
             raise InvalidSlot(f"{{{slot.name}}}: {fix}")
         if slot.is_amount and not isinstance(value, str) and value < 0:
             raise InvalidSlot(f"{{{slot.name}}} is negative: name its direction by a slot for a side or a trend")
+        if not isinstance(value, str) and value * slot.stated_sign < 0:
+            raise InvalidSlot(f"{{{slot.name}}} is {value:g} here, which the word before it contradicts")
         if not isinstance(value, str):
             text = _DIGITS[digits] % (abs(value) if slot.is_paired else value)
         elif unit:  # a box

@@ -33,6 +33,10 @@ SLOT_MARK = "\ufffc"  # replaces a slot in the text without slots
 _BRACES = re.compile(r"\{([^{}]*)\}")
 _ARTICLE = re.compile(r"\b([Aa])n?\s+$")
 _AMOUNT = {"en": re.compile(r"\bby\s+$", re.IGNORECASE), "zh": re.compile(r"了\s*$")}
+# Words of a direction shortly before a change, a rate or a climb, which must not have the other sign.
+_RISES = {"en": r"increas|grow|ris(?:e|ing)|rose|climb|ascend|widen|reced", "zh": "增|上升|升高|爬升|变大|扩大|远离"}
+_FALLS = {"en": r"decreas|shr[iu]nk|(?:f[ae]ll|drop)(?!\w*\s+b(?:ack|ehind))|descend|sink|narrow|approach", "zh": "减|下降|降低|缩|变小|靠近|接近"}
+_NEAR = {"en": r"\w*(?:\s+\w+){0,3}\s+$", "zh": r"[^，。；,;]{0,6}$"}
 _VERBS = ("target_motion", "drone_motion", "walking")
 _ALIASES = {  # what prompts call a slot -> its reference; "compared" is the comparison seen from the target
     "compare:drone_speed,target_speed": "comparison:speed",
@@ -57,6 +61,7 @@ class Slot:
     # the number, however small.
     is_paired: bool = False
     is_amount: bool = False  # a word of the writer states its direction, so it must not be negative
+    stated_sign: int = 0  # of a word of the writer before it: 1 rises, -1 falls
     article: str = ""  # "a" before the slot, which becomes "an" if the value needs it; "" if there is none
 
     @property
@@ -93,7 +98,7 @@ def read_sentence(text: str, language: Language, num_frames: int) -> Sentence:
         slots.append(slot)
     slots = _paired(slots, num_frames)
     slots = [
-        replace(slot, is_amount=True) if _is_amount(slot, before, language) else slot
+        replace(slot, is_amount=_is_amount(slot, before, language), stated_sign=_stated_sign(slot, before, language))
         for slot, before in zip(slots, texts, strict=False)
     ]
     outside = SLOT_MARK.join(texts)  # with the spaces and articles that the writer chose
@@ -194,6 +199,19 @@ def _is_amount(slot: Slot, before: str, language: Language) -> bool:
     """Return whether a word of the writer states the direction of a change: "has fallen by {change:distance}"."""
     is_change = slot.reference is not None and slot.reference.aspect in ("change", "growth")
     return is_change and not slot.is_paired and bool(_AMOUNT[language].search(before))
+
+
+def _stated_sign(slot: Slot, before: str, language: Language) -> int:
+    """Return the direction that a word before a change, a rate or a climb states: 1 rises, -1 falls, 0 none."""
+    reference = slot.reference
+    if reference is None or not (reference.quantity == "climb_rate" or reference.aspect in ("change", "rate")):
+        return 0
+    if slot.is_paired or QUANTITIES[reference.quantity].sides:
+        return 0
+    signs = {1: _RISES, -1: _FALLS}
+    ends = {sign: f"(?:{words[language]}){_NEAR[language]}" for sign, words in signs.items()}
+    stated = [sign for sign, end in ends.items() if re.search(end, before, re.IGNORECASE)]
+    return stated[0] if len(stated) == 1 else 0
 
 
 # --- words around a slot ----------------------------------------------------------------------------------------------

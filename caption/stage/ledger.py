@@ -35,8 +35,8 @@ REASONS = {
     "regeneration_failed": "the decision was in conflict, and no regenerated answer was accepted; see `checks.refused`",
     "decision_mismatch": "the action that the model names after its reasoning is not the decision",
     "contradicted_value": "a number of the text contradicts the measured facts; see `checks.contradictions`",
-    "invalid_slot": "a slot names no known fact of the window, its braces or unit do not fit, or its side is no reason "
-    "for the turn; try caption.writing=prose",
+    "invalid_slot": "a slot names no known fact of the window, its braces or unit do not fit, or the words next to it "
+    "contradict its value; see `checks.refused`",
     "no_reason": "no observed fact supports a decision, or the label in a regeneration",
     "bilingual": "the two languages do not say the same; see `checks.bilingual`",
 }

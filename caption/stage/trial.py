@@ -111,10 +111,10 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
                 yield "fix: remove caption.endpoint.json_schema=false, so that the server enforces the fields"
         else:
             yield f"no answer: {for_terminal(str(outcome))}"
-        if num_cut := sum(reply.finish_reason == "length" for _, reply in of_window):
-            limit = f"caption.endpoint.max_tokens={cfg.endpoint.max_tokens}"
-            fix = "raise it, or if the answers repeat themselves, use a larger model"
-            yield f"fix: {num_cut} of {len(of_window)} answers were cut at {limit}; {fix}"
+        for number, (_, reply) in enumerate(of_window, 1):
+            if reply.cut_advice:
+                limit = f"caption.endpoint.max_tokens={cfg.endpoint.max_tokens}"
+                yield f"fix: answer {number} is cut at {limit}: {reply.cut_advice}"
     num_accepted = sum(isinstance(outcome, Caption) and outcome.status == "accepted" for outcome in outcomes)
     if not num_accepted:
         yield "fix: no window was accepted; use a larger model, or one that was trained on such captions"

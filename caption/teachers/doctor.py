@@ -218,10 +218,10 @@ class _Examination:
         trial = await self._ask("the largest prompt", self.largest, endpoint.max_tokens, schema)
         if trial.reply is not None:
             await self._check_context(trial.prompt_tokens)
-            if trial.reply.finish_reason == "length":
+            if trial.reply.cut_advice:
                 limit = f"caption.endpoint.max_tokens={endpoint.max_tokens}"
-                fix = "a good answer takes about 200 tokens: raise the limit, or use a model that ends its answers"
-                self._add("answer length", "warning", f"the answer is cut at {limit}; {fix}")
+                fix = f"{trial.reply.cut_advice}; a good answer takes about 200 tokens"
+                self._add("answer length", "warning", f"the answer is cut at {limit}: {fix}")
             self._report_speed(trial.seconds)
         elif trial.seconds >= endpoint.timeout_s:
             await self._report_too_slow()
@@ -268,7 +268,7 @@ class _Examination:
     def _report_speed(self, seconds: float) -> None:
         """Report the time of the answer to the largest prompt."""
         limit_s = self.cfg.endpoint.timeout_s
-        detail = f"{seconds:.1f} s for one answer to the largest prompt"
+        detail = f"{seconds:.1f} s for an answer to the largest prompt, which no cache holds; most answers take less"
         if 2 * seconds <= limit_s or self.cfg.endpoint.concurrency == 1:
             self._add("speed", "ok", detail)
             return

@@ -37,8 +37,8 @@ class Facts:
     """Measured series, oldest frame first; None where a value cannot be measured.
 
     What is measured of the target is None at frames in which it is hidden or out of view. A velocity is the slope of
-    the straight line that fits positions best: of up to five neighbouring frames, or of the whole window if the track
-    jitters, so that a perturbation is not reported as motion. Axes are those of the drone at the current frame: forward
+    the straight line that fits positions best, of up to five neighbouring frames. If the track jitters, only the current
+    frame has one, of the whole window, so that a perturbation is not reported as motion. Axes are those of the drone at the current frame: forward
     along its heading, left, up. Angles in the horizontal plane are positive to the left.
     """
 
@@ -236,7 +236,7 @@ def _velocities(
     Args:
         axes: for each axis its values at the frames; a velocity is their slope per second.
         smooth: the largest root mean square deviation from a parabola, in units of the axes, of a track without jitter;
-            beyond it every frame has the velocity of the whole window, not that of its neighbours.
+            beyond it the current frame alone has a velocity, that of the whole window.
     """
     fit = _fit_of(known)
     if not all(known):  # a weight of 0 does not hide NaN
@@ -244,7 +244,7 @@ def _velocities(
     whole = [_weighted(fit.line, axis) / step_s for axis in axes]
     squares = sum([_weighted(weights, axis) ** 2 for axis in axes for weights in fit.residuals])
     if squares > smooth * smooth * len(fit.residuals):
-        return whole, [[slope if is_known else math.nan for is_known in known] for slope in whole]
+        return whole, [[*[math.nan] * (len(known) - 1), slope if known[-1] else math.nan] for slope in whole]
     return whole, [[_weighted(weights, axis) / step_s for weights in fit.lines] for axis in axes]
 
 

@@ -18,6 +18,7 @@ Result = TypeVar("Result")
 CountName = Literal["prompt_tokens", "completion_tokens"]
 AT_ONCE = b"error: interrupted at once\n"
 AT_ONCE_WITH_WORK = b"error: interrupted at once; recorded answers are kept; run the same command again to continue\n"
+REPEATED = 40  # characters at the end of an answer that occur in it before: the model repeats itself
 MOST_TOKENS = 10_000_000  # of one answer: longer than the context of any model
 STOP_AFTER_FAILURES = 20  # consecutive windows or samples without an answer after which a run ends
 
@@ -40,6 +41,14 @@ class Reply:
     finish_reason: str | None = None  # the server's, or CONTEXT_FULL
     num_thoughts: int = field(default=0, compare=False)  # characters of thoughts in a field of their own
     is_kept: bool = field(default=False, compare=False)  # read from the journal
+
+    @property
+    def cut_advice(self) -> str:
+        """What helps if `max_tokens` has cut the answer; "" if it has not."""
+        if self.finish_reason != "length":
+            return ""
+        repeats = self.text[-REPEATED:] in self.text[:-REPEATED]
+        return "it repeats itself, so use a larger model" if repeats else "raise this limit"
 
 
 @dataclass(eq=False)
