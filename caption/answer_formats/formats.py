@@ -160,7 +160,8 @@ def fact_table(facts: Facts) -> str:
 _DIGITS = ("%.0f", "%.1f", "%.2f")  # by the number of digits after the point
 _NEITHER = ("straight", "centred")  # words of a side that say neither side
 # A side of these is a reason to turn to it; when the drone itself moves to the left, it may have to turn to the right.
-_TURN_REASONS = ("yaw", "offset_x", "bearing", "target_sideways_speed")
+# With a first frame it may be a side of an earlier time.
+_TURN_REASONS = [(name, "side", None) for name in ("yaw", "offset_x", "bearing", "target_sideways_speed")]
 _VOWEL = re.compile(r"[aeio]|8|1[18]\b")  # what begins with a vowel when it is spoken: eight, eleven, eighteen
 
 
@@ -181,13 +182,8 @@ class Filler:
         """Raise InvalidSlot if a sentence gives a fact to one side as the reason for a turn to the other."""
         other = "left" if "right" in self.decision else "right"
         for slot in sentence.slots:
-            reference = slot.reference  # one with a first frame may be of an earlier time
-            if (
-                reference
-                and reference.quantity in _TURN_REASONS
-                and (reference.aspect, reference.first) == ("side", None)
-            ):
-                fact = look_up(reference, self.facts)
+            if slot.reference and slot.reference[:3] in _TURN_REASONS:
+                fact = look_up(slot.reference, self.facts)
                 if isinstance(fact, Fact) and fact.value == other:
                     raise InvalidSlot(f"{{{slot.name}}} is {other} here, which is no reason for {self.decision}")
 
@@ -212,10 +208,10 @@ class Filler:
         if value in _NEITHER and slot.needs_side:
             fix = f"it is {value} here, neither side: leave this slot out, or write `is {{{slot.name}}}`"
             raise InvalidSlot(f"{{{slot.name}}}: {fix}")
-        if slot.is_amount and not isinstance(value, str) and value < 0:
-            raise InvalidSlot(f"{{{slot.name}}} is negative: name its direction by a slot for a side or a trend")
-        if not isinstance(value, str) and value * slot.stated_sign < 0:
-            raise InvalidSlot(f"{{{slot.name}}} is {value:g} here, which the word before it contradicts")
+        sign = 0 if isinstance(value, str) else (value > 0) - (value < 0)
+        if (slot.not_negative and sign < 0) or (slot.not_positive and sign > 0):
+            fix = "name its direction by a slot for a side or a trend"
+            raise InvalidSlot(f"{{{slot.name}}} is {value} here, which does not fit the words before it: {fix}")
         if not isinstance(value, str):
             text = _DIGITS[digits] % (abs(value) if slot.is_paired else value)
         elif unit:  # a box

@@ -32,11 +32,15 @@ from cosfly.runtime.errors import nearest
 SLOT_MARK = "\ufffc"  # replaces a slot in the text without slots
 _BRACES = re.compile(r"\{([^{}]*)\}")
 _ARTICLE = re.compile(r"\b([Aa])n?\s+$")
-_AMOUNT = {"en": re.compile(r"\bby\s+$", re.IGNORECASE), "zh": re.compile(r"了\s*$")}
-# Words of a direction shortly before a change, a rate or a climb, which must not have the other sign.
-_RISES = {"en": r"increas|grow|ris(?:e|ing)|rose|climb|ascend|widen|reced", "zh": "增|上升|升高|爬升|变大|扩大|远离"}
-_FALLS = {"en": r"decreas|shr[iu]nk|(?:f[ae]ll|drop)(?!\w*\s+b(?:ack|ehind))|descend|sink|narrow|approach", "zh": "减|下降|降低|缩|变小|靠近|接近"}
+# Words before a change, a rate or a climb: of an amount, which is not negative, or of a direction, which is its sign.
+_AMOUNT = {"en": r"\bby\s+$", "zh": r"了\s*$"}
+_RISES = {"en": r"(?:increas|grow|ris[ei]|rose|climb|ascend|widen|reced)", "zh": "(?:增|升|变大|扩大|远离)"}
+_FALLS = {
+    "en": r"(?:decreas|shr[iu]nk|(?:f[ae]ll|drop)(?!\w*\s+b(?:ack|ehind))|descend|sink|narrow|approach)",
+    "zh": "(?:减|降|缩|变小|靠近|接近)",
+}
 _NEAR = {"en": r"\w*(?:\s+\w+){0,3}\s+$", "zh": r"[^，。；,;]{0,6}$"}
+_CHANGES = ("change", "rate", "growth")
 _VERBS = ("target_motion", "drone_motion", "walking")
 _ALIASES = {  # what prompts call a slot -> its reference; "compared" is the comparison seen from the target
     "compare:drone_speed,target_speed": "comparison:speed",
@@ -60,8 +64,8 @@ class Slot:
     # Another slot of the sentence has the same direction: a number is written without its sign, and a side is that of
     # the number, however small.
     is_paired: bool = False
-    is_amount: bool = False  # a word of the writer states its direction, so it must not be negative
-    stated_sign: int = 0  # of a word of the writer before it: 1 rises, -1 falls
+    not_negative: bool = False  # because of the words before it
+    not_positive: bool = False
     article: str = ""  # "a" before the slot, which becomes "an" if the value needs it; "" if there is none
 
     @property
@@ -97,10 +101,7 @@ def read_sentence(text: str, language: Language, num_frames: int) -> Sentence:
         texts[i + 1] = _without_repetition(slot, after, language)
         slots.append(slot)
     slots = _paired(slots, num_frames)
-    slots = [
-        replace(slot, is_amount=_is_amount(slot, before, language), stated_sign=_stated_sign(slot, before, language))
-        for slot, before in zip(slots, texts, strict=False)
-    ]
+    slots = [_with_bounds(slot, before, language) for slot, before in zip(slots, texts, strict=False)]
     outside = SLOT_MARK.join(texts)  # with the spaces and articles that the writer chose
     if language == "zh":  # a space before a number, none behind its unit
         texts[1:] = [re.sub(r"^ +(?=[\u4e00-\u9fff])", "", part) for part in texts[1:]]
@@ -186,32 +187,26 @@ def _direction_of(slot: Slot, num_frames: int) -> Direction | None:
         return Direction("comparison", 0, current)
     if name == "yaw" and not aspect:  # a yaw is counted from t0
         return Direction("side:yaw", 0, frame)
-    if name in TURNS and aspect in ("change", "rate", "growth", "side"):
+    if name in TURNS and aspect in (*_CHANGES, "side"):
         return Direction(f"side:{name}", start, end)
-    if not QUANTITIES[name].sides and aspect in ("change", "rate", "growth", "trend"):
+    if not QUANTITIES[name].sides and aspect in (*_CHANGES, "trend"):
         return Direction(f"trend:{name}", start, end)
     if aspect == "side" or (not aspect and has_sides(name)):
         return Direction(f"side:{name}", frame, frame)
     return None
 
 
-def _is_amount(slot: Slot, before: str, language: Language) -> bool:
-    """Return whether a word of the writer states the direction of a change: "has fallen by {change:distance}"."""
-    is_change = slot.reference is not None and slot.reference.aspect in ("change", "growth")
-    return is_change and not slot.is_paired and bool(_AMOUNT[language].search(before))
-
-
-def _stated_sign(slot: Slot, before: str, language: Language) -> int:
-    """Return the direction that a word before a change, a rate or a climb states: 1 rises, -1 falls, 0 none."""
+def _with_bounds(slot: Slot, before: str, language: Language) -> Slot:
+    """Return a slot with what the words before it say of its sign: "has fallen by {change:distance}"."""
     reference = slot.reference
-    if reference is None or not (reference.quantity == "climb_rate" or reference.aspect in ("change", "rate")):
-        return 0
-    if slot.is_paired or QUANTITIES[reference.quantity].sides:
-        return 0
-    signs = {1: _RISES, -1: _FALLS}
-    ends = {sign: f"(?:{words[language]}){_NEAR[language]}" for sign, words in signs.items()}
-    stated = [sign for sign, end in ends.items() if re.search(end, before, re.IGNORECASE)]
-    return stated[0] if len(stated) == 1 else 0
+    if reference is None or slot.is_paired or not (slot.name == "climb_rate" or reference.aspect in _CHANGES):
+        return slot
+    is_amount = re.search(_AMOUNT[language], before, re.IGNORECASE) is not None
+    rises, falls = (
+        not QUANTITIES[reference.quantity].sides and bool(re.search(words[language] + _NEAR[language], before, re.I))
+        for words in (_RISES, _FALLS)
+    )
+    return replace(slot, not_negative=is_amount or (rises and not falls), not_positive=falls and not rises)
 
 
 # --- words around a slot ----------------------------------------------------------------------------------------------

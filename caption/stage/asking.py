@@ -19,7 +19,7 @@ from caption.stage.window_loop import caption_window
 from caption.teachers.judge import Judge, open_judge
 from caption.teachers.prompt_files import Vocabulary
 from caption.teachers.teacher import AskingTeacher, Teacher, open_teacher
-from cosfly.formats.captions import Caption, Usage, read_captions, write_captions
+from cosfly.formats.captions import Caption, Usage, write_captions
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook, Budget, BudgetSpent
 from cosfly.llm.client import ChatClient
@@ -135,7 +135,7 @@ class Asking:
                     if part.exists() and track.name in self.retried_tracks:  # it is unfinished again
                         part.replace(track.gap(self.stage.path))
                     if part.exists():
-                        self._skip_finished(part, guess)
+                        self._skip_finished(guess)
                     elif not self.outcome.stopped:
                         await self._ask_track(track, tasks)
         except BaseExceptionGroup as errors:
@@ -148,10 +148,9 @@ class Asking:
                 except (CosflyError, OSError) as error:  # the run already ends with another error
                     log.error("caption: %s: %s", track.name, error)
 
-    def _skip_finished(self, part: Path, num_windows: int) -> None:
+    def _skip_finished(self, num_windows: int) -> None:
         """Count a track that an earlier run finished."""
-        if not self.has_accepted:
-            self.has_accepted = any(caption.status == "accepted" for caption in read_captions(part))
+        self.has_accepted = True  # most probably
         self.outcome.tracks.input += 1
         self.outcome.tracks.kept += 1
         self.progress.skip(num_windows)
@@ -229,7 +228,10 @@ class Asking:
             if isinstance(error, CosflyError) and error.fatal:
                 raise
             code = error.cause if isinstance(error, NoAnswer) else error.code
-            self._record_unanswered(Failed(id=sample_id, code=code, message=str(error)))
+            failure = Failed(id=sample_id, code=code, message=str(error))
+            self.outcome.unanswered.append(failure)
+            self.progress.add(None)
+            self._count_failure(failure, self.outcome.causes)
         else:
             self._record_refusal(caption)
             self._stop_if_hopeless(caption)
@@ -240,13 +242,6 @@ class Asking:
             self.window_is_done.set()
         return None
 
-    def _record_unanswered(self, failure: Failed) -> None:
-        """Record a window without an answer."""
-        self.outcome.unanswered.append(failure)
-        self.quarantine[failure.id] = failure
-        self.progress.add(None)
-        self._count_failure(self.outcome.causes)
-
     def _record_refusal(self, caption: Caption) -> None:
         """Keep a window that was refused or declined, or that did not fit the context, for `--retry-failed`."""
         refusal, sample_id = caption.checks.refusal, caption.sample_id
@@ -255,11 +250,11 @@ class Asking:
             self.quarantine.pop(sample_id, None)
         else:
             code, _, message = refusal.partition(": ")
-            self.quarantine[sample_id] = Failed(id=sample_id, code=code, message=message)
-            self._count_failure(refusal)
+            self._count_failure(Failed(id=sample_id, code=code, message=message), refusal)
 
-    def _count_failure(self, got: str) -> None:
-        """Count a window that was refused or got no answer; many in a row are a fault of the server."""
+    def _count_failure(self, failure: Failed, got: str) -> None:
+        """Record a window that was refused or got no answer; many in a row are a fault of the server."""
+        self.quarantine[failure.id] = failure
         self.num_failed_in_row += 1
         if self.num_failed_in_row >= STOP_AFTER_FAILURES:
             what = f"{self.num_failed_in_row} windows in a row got no answer or were refused"
@@ -338,20 +333,18 @@ class RunProgress:
         """The answers of this run and their tokens."""
         return self.budget.totals - self._totals_before
 
-    def _waiting(self) -> str:
-        waiting_s = time.monotonic() - self._answered_s
-        return f", waiting for {duration(waiting_s)}" if waiting_s >= SECONDS_BETWEEN_LINES else ""
-
     def figures(self) -> str:
         """Return the figures of the run as a text."""
         prices, windows, answers = self.budget.cfg, self.windows, self._answers
         reasons = ", ".join(f"{reason} {count}" for reason, count in windows.dropped.most_common(4))
         elapsed_s = time.monotonic() - self._start_s
+        waiting_s = time.monotonic() - self._answered_s
+        waiting = f", waiting for {duration(waiting_s)}" if waiting_s >= SECONDS_BETWEEN_LINES else ""
         figures = [
             f"accepted {windows.kept:,} (repaired {self.num_repaired:,})",
             f"dropped {windows.dropped.total():,}" + (f" ({reasons})" if reasons else ""),
             f"no answer {windows.failed.total():,}",
-            f"answers {answers['answers']:,} in {duration(elapsed_s)}" + self._waiting(),
+            f"answers {answers['answers']:,} in {duration(elapsed_s)}{waiting}",
             f"tokens {answers['prompt_tokens']:,} read {answers['completion_tokens']:,} written",
         ]
         if answers["cut"]:

@@ -104,7 +104,6 @@ class CaptionReport(BaseModel, extra="forbid"):
     structure: Counts = Counter()
     rejected_answers: Counts = Counter()  # of the right structure
     bilingual: Counts = Counter()
-    writing: Counts = Counter()  # of accepted captions
     values: dict[str, Counts] = {}  # language -> values_filled, values_matched, values_contradicted
     contradicted_captions: int = 0
     recovered: Counts = Counter()
@@ -149,7 +148,6 @@ class CaptionReport(BaseModel, extra="forbid"):
         if caption.status == "accepted":
             self.windows.kept += 1
             self.verdicts_of_accepted[str(caption.verdict)] += 1
-            self.writing[caption.writing] += 1
         else:
             # A refused request is a failure of the server, not a fault of the caption.
             tally = self.windows.failed if caption.drop_reason == "refused" else self.windows.dropped

@@ -111,10 +111,6 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
                 yield "fix: remove caption.endpoint.json_schema=false, so that the server enforces the fields"
         else:
             yield f"no answer: {for_terminal(str(outcome))}"
-        for number, (_, reply) in enumerate(of_window, 1):
-            if reply.cut_advice:
-                limit = f"caption.endpoint.max_tokens={cfg.endpoint.max_tokens}"
-                yield f"fix: answer {number} is cut at {limit}: {reply.cut_advice}"
     num_accepted = sum(isinstance(outcome, Caption) and outcome.status == "accepted" for outcome in outcomes)
     if not num_accepted:
         yield "fix: no window was accepted; use a larger model, or one that was trained on such captions"
@@ -156,6 +152,8 @@ def _answer_lines(number: int, reply: Reply) -> Iterator[str]:
     tokens = f"{usage.prompt_tokens} tokens in, {usage.completion_tokens} out" if usage else "tokens not reported"
     yield f"--- answer {number} ({tokens}{_problem_of(reply)}) ---"
     yield for_terminal(reply.text, LONGEST_LOG)
+    if reply.cut_advice:
+        yield f"fix: the answer is cut at caption.endpoint.max_tokens: {reply.cut_advice}"
 
 
 def _problem_of(reply: Reply) -> str:

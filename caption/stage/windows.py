@@ -18,7 +18,6 @@ from cosfly.formats.captions import LabelFrom
 from cosfly.formats.frames import files_in
 from cosfly.formats.places import sample_id
 from cosfly.formats.playback import Track
-from cosfly.formats.segments import Mission
 
 
 def current_frames(num_points: int, cfg: WindowConfig) -> range:
@@ -40,8 +39,8 @@ def cut_windows(track: Track, cfg: WindowConfig, twin: Track | None = None) -> I
         problem = None
         if cfg.require_images and without_picture.intersection(observed.indices):
             problem = "unusable_frame"
-        elif order_comes_within(mission, current, cfg.future_frames):
-            problem = "order_to_come"
+        elif mission is not None and current < mission.at_frame <= current + cfg.future_frames:
+            problem = "order_to_come"  # which moves the drone and is not known yet
         yield Window(observed, cut_future(track, motion, current, cfg.future_frames), problem)
 
 
@@ -84,12 +83,6 @@ def observe(
         frame_files=tuple(files[span]), mission=order,
         goal=None if goal is None or track.bystanders is None else {"en": goal.en, "zh": goal.zh},
     )  # fmt: skip
-
-
-def order_comes_within(mission: Mission | None, current: int, future_frames: int) -> bool:
-    """Return whether an order moves the drone in the future of a frame at which it is not known yet, so that the label
-    does not follow from what is seen."""
-    return mission is not None and current < mission.at_frame <= current + future_frames
 
 
 def cut_future(track: Track, motion: LabelMotion, current: int, future_frames: int) -> FutureMotion:

@@ -53,21 +53,15 @@ class Finding:
     detail: str
 
 
-def examine_endpoint(
-    url: str, cfg: CaptionConfig, vocabulary: Vocabulary, most_requests: int | None = None
-) -> list[Finding]:
-    """Try an endpoint, with at most `most_requests`, and show the progress. It is usable if no finding is `unusable`.
-    TeacherError: The URL cannot be asked."""
+def examine_endpoint(url: str, cfg: CaptionConfig, vocabulary: Vocabulary) -> list[Finding]:
+    """Try an endpoint and show the progress. It is usable if no finding is `unusable`. TeacherError: The URL cannot be
+    asked."""
     # A greeting, the schema, a prompt with pictures and one without, the largest prompt, a longer one.
     num_requests = 1 + bool(cfg.endpoint.json_schema) + 2 * bool(cfg.num_images) + 2
     with progress_bar("doctor", num_requests) as advance:
         largest = largest_messages(cfg, vocabulary)
-        examination = _Examination(ChatClient(url, cfg.endpoint), cfg, largest, advance, most_requests)
+        examination = _Examination(ChatClient(url, cfg.endpoint), cfg, largest, advance)
         return run_until_interrupted(examination.run(), keeps_work=False)
-
-
-class _LimitReached(Exception):
-    """The examination has sent as many requests as it may."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +90,6 @@ class _Examination:
     cfg: CaptionConfig
     largest: list[dict]  # messages as long as ours get
     advance: Advance
-    most_requests: int | None
-    num_requests: int = 0
     tokens_per_s: float | None = None  # of the last answer that reports its tokens
     findings: list[Finding] = field(default_factory=list)
 
@@ -111,8 +103,6 @@ class _Examination:
                     await self._check_largest_prompt()
         except TeacherError as error:
             self._add("model", "unusable", str(error))
-        except _LimitReached:
-            self._add("limit", "warning", f"stopped after {self.num_requests} requests; further checks are not made")
         finally:
             await self.client.close()
         if refusal := self.client.left_out.get("no_system"):
@@ -126,10 +116,11 @@ class _Examination:
         """Send one request."""
         endpoint = self.cfg.endpoint.model_copy(update={"max_tokens": max_tokens})
         request = endpoint.request(messages, [], schema or {}, seed=0)
+        on_send = partial(self.advance, 1, f"{what}, limit {endpoint.timeout_s:g} s")
         reply, failure = None, ""
         start_s = time.monotonic()
         try:
-            reply = await self.client.ask(request, partial(self._count, what))
+            reply = await self.client.ask(request, on_send)
         except (TimeoutError, httpx.RequestError) as error:
             failure = self.client.message_of(error)
         except Refusal as refusal:
@@ -142,12 +133,6 @@ class _Examination:
         if reply is not None and reply.usage is not None and reply.usage.completion_tokens:
             self.tokens_per_s = reply.usage.completion_tokens / seconds
         return _Trial(reply, failure, seconds)
-
-    def _count(self, what: str) -> None:
-        if self.num_requests == self.most_requests:
-            raise _LimitReached
-        self.num_requests += 1
-        self.advance(1, f"{what}, limit {self.cfg.endpoint.timeout_s:g} s")
 
     async def _check_answers(self) -> bool:
         """Send a greeting; return whether it is answered."""
@@ -224,7 +209,7 @@ class _Examination:
                 self._add("answer length", "warning", f"the answer is cut at {limit}: {fix}")
             self._report_speed(trial.seconds)
         elif trial.seconds >= endpoint.timeout_s:
-            await self._report_too_slow()
+            self._report_too_slow()
         else:
             self._add("context length", "unusable", f"the largest prompt gets no answer: {trial.failure}")
 
@@ -240,19 +225,11 @@ class _Examination:
         else:
             self._add("context length", "ok", detail + (f" of the context of {context}" if context else ""))
 
-    async def _report_too_slow(self) -> None:
+    def _report_too_slow(self) -> None:
         """Report that the largest prompt gets no answer in time, and what helps."""
         endpoint = self.cfg.endpoint
         detail = f"the largest prompt gets no answer within {endpoint.timeout_s:g} s"
         answer_s = endpoint.max_tokens / self.tokens_per_s if self.tokens_per_s else 0.0
-        if endpoint.json_schema and answer_s <= endpoint.timeout_s:  # else it is too slow without a schema, too
-            system, *others = self.largest
-            other = [system | {"content": f"Again.\n{system['content']}"}, *others]  # which no cache holds
-            plain = await self._ask("the largest prompt without a JSON schema", other, endpoint.max_tokens)
-            if plain.reply is not None:
-                contrast = f"but one within {plain.seconds:.0f} s without a JSON schema"
-                self._add("speed", "unusable", f"{detail}, {contrast}: set caption.endpoint.json_schema=false")
-                return
         longer_s = 2 * endpoint.timeout_s
         shorter = "lower caption.endpoint.max_tokens"
         if self.tokens_per_s:

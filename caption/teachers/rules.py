@@ -352,10 +352,6 @@ def expects_slow_down(f: Facts, side: int) -> bool:
     return not gap_opens(f, side) and not is_slower(f) and expects(FAMILIES["slow_down"])(f, side)
 
 
-def is_ordered(kind: str) -> Condition:
-    return lambda f, side: f.mission == kind
-
-
 # Conditions whose name in rule_sentences.yaml is that of their function.
 NAMED = (
     stands, turns, crosses, comes, walks_away, off_centre, sight_turns, drifts, turn_ends, slides, strafes_on, overtakes,
@@ -436,7 +432,7 @@ CONDITIONS: dict[str, Condition] = {
     # Bystanders, expected decisions and orders.
     "bystander_near": lambda f, side: f.is_visible_now and _or_far(f.other_distance_m[-1]) <= NEAR_M,
     **{f"expects_{name}": expects(family) for name, family in FAMILIES.items() if name != "slow_down"},
-    **{kind: is_ordered(kind) for kind in MISSION_KINDS},
+    **{kind: lambda f, side, kind=kind: f.mission == kind for kind in MISSION_KINDS},  # type: ignore[misc]
 }
 
 

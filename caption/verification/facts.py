@@ -37,9 +37,9 @@ class Facts:
     """Measured series, oldest frame first; None where a value cannot be measured.
 
     What is measured of the target is None at frames in which it is hidden or out of view. A velocity is the slope of
-    the straight line that fits positions best, of up to five neighbouring frames. If the track jitters, only the current
-    frame has one, of the whole window, so that a perturbation is not reported as motion. Axes are those of the drone at the current frame: forward
-    along its heading, left, up. Angles in the horizontal plane are positive to the left.
+    the straight line that fits positions best, of up to five neighbouring frames. If the track jitters, only the
+    current frame has one, of the whole window, so that a perturbation is not reported as motion. Axes are those of the
+    drone at the current frame: forward along its heading, left, up. Angles are positive to the left.
     """
 
     # The drone.

@@ -25,7 +25,10 @@ def check_mirror(english: Coc, chinese: Coc, facts: Facts) -> str | None:
     if english.flight_decision != chinese.flight_decision:
         return "decision"
     texts_en, texts_zh = _texts(english), _texts(chinese)
-    if not (_are_in_script(texts_en, "en") and _are_in_script(texts_zh, "zh")):
+    parts: dict[Language, list[str]] = {"en": texts_en, "zh": texts_zh}
+    if not all(
+        is_in_script(part, name) for name, texts in parts.items() for text in texts for part in cut_sentences(text)
+    ):
         return "script"
     numbers_en, numbers_zh = _numbers(texts_en, "en"), _numbers(texts_zh, "zh")
     series = _measured_series(facts)
@@ -38,10 +41,6 @@ def check_mirror(english: Coc, chinese: Coc, facts: Facts) -> str | None:
 
 def _texts(coc: Coc) -> list[str]:
     return [coc.critical_components, coc.reasoning_trace]
-
-
-def _are_in_script(texts: Sequence[str], language: Language) -> bool:
-    return all(is_in_script(part, language) for text in texts for part in cut_sentences(text))
 
 
 def _measured_series(f: Facts) -> dict[str, list[Series]]:

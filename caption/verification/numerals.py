@@ -60,10 +60,11 @@ def read_numerals(text: str, language: Language) -> list[Numeral]:
             unit = {"m": "mps", "deg": "dps"}[unit]
         if language == "zh" and (unit, factor) == ("m", 1000.0) and _HOURLY.search(before):
             unit, factor = "mps", 1 / 3.6
-        number = _number_of(match, unit)
-        if number is None:
-            continue
-        value, digits = number
+        half = 0.5 if match.groupdict().get("half") else 0.0
+        number = match["digits"].replace("−", "-")
+        digits, value = len(number.partition(".")[2]), abs(float(number)) + half
+        if not unit and digits == 0 and value < 10 and not half and number[0] not in "+-":
+            continue  # a count
         bound = -1 if stands_at("less", before, after, language) else 0
         if stands_at("more", before, after, language):
             bound = 1
@@ -71,12 +72,3 @@ def read_numerals(text: str, language: Language) -> list[Numeral]:
         written = match.group().strip()
         numerals.append(Numeral(written, value * factor, unit, digits, factor, bound, is_about, match.start()))
     return numerals
-
-
-def _number_of(match: re.Match[str], unit: str) -> tuple[float, int] | None:
-    """Return the value of a number and its digits after the point; None if it is a count."""
-    half = 0.5 if match.groupdict().get("half") else 0.0
-    written = match["digits"].replace("−", "-")
-    digits, value = len(written.partition(".")[2]), abs(float(written)) + half
-    is_count = not unit and digits == 0 and value < 10 and not half and written[0] not in "+-"
-    return None if is_count else (value, digits)

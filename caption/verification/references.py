@@ -223,7 +223,12 @@ def _relation(reference: Reference, facts: Facts, at: int) -> str | None:
     """Return the word of a comparison, of a side at a frame, or of a turn's side or a trend over a span."""
     name, aspect, *_ = reference
     if aspect in ("comparison", "compared"):
-        return _compared_speed(facts.mean_speed_mps, facts.target_speed_mps, is_reversed=aspect == "compared")
+        drone_mps, target_mps = facts.mean_speed_mps, facts.target_speed_mps
+        if target_mps is None:
+            return None
+        if abs(drone_mps - target_mps) <= max(MATCHING_MPS, MATCHING_SHARE * target_mps):
+            return "matching"
+        return "faster" if (drone_mps > target_mps) != (aspect == "compared") else "slower"
     quantity = QUANTITIES[name]
     values = _span(reference, facts)
     if aspect == "side":
@@ -237,15 +242,6 @@ def _relation(reference: Reference, facts: Facts, at: int) -> str | None:
         # A trend is that of the size: an offset to the left that shrinks is no increase.
         return _REVERSED[trend] if max(values) <= 0 else None
     return trend
-
-
-def _compared_speed(drone_mps: float, target_mps: float | None, *, is_reversed: bool) -> str | None:
-    """Return how the drone's speed compares with the target's, reversed the other way round; None if not known."""
-    if target_mps is None:
-        return None
-    if abs(drone_mps - target_mps) <= max(MATCHING_MPS, MATCHING_SHARE * target_mps):
-        return "matching"
-    return "faster" if (drone_mps > target_mps) != is_reversed else "slower"
 
 
 def _over_span(reference: Reference, facts: Facts) -> float | None:

@@ -67,19 +67,17 @@ def caption(
 def doctor(
     job: Job,
     url: Annotated[str, Argument(help="URL of an OpenAI-compatible server.")],
-    limit: Annotated[int | None, Option(min=1, help="Stop after this many requests.")] = None,
 ) -> None:
     """Test what a server can do: text, images, schema, thinking, context, time. Exit with 1 if it cannot caption."""
-    _examine_endpoint(url, job.cfg.caption, limit)
-    if limit is None:
-        typer.echo("Pass --no-check to cosfly caption with these settings: it would repeat the tests.")
+    _examine_endpoint(url, job.cfg.caption)
+    typer.echo("Pass --no-check to cosfly caption with these settings: it would repeat the tests.")
 
 
-def _examine_endpoint(url: str, cfg: CaptionConfig, limit: int | None = None) -> None:
+def _examine_endpoint(url: str, cfg: CaptionConfig) -> None:
     from caption.teachers.doctor import examine_endpoint
     from caption.teachers.prompt_files import vocabulary_of
 
-    options.print_checks(examine_endpoint(url, cfg, vocabulary_of(cfg), limit), "What the server can do")
+    options.print_checks(examine_endpoint(url, cfg, vocabulary_of(cfg)), "What the server can do")
 
 
 @command("cosfly caption prompts --export my-prompts", "caption")
