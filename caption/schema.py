@@ -77,10 +77,7 @@ class ObservedWindow:
 
 @dataclass(frozen=True)
 class FutureMotion:
-    """The motion after the current frame. Never shown to a teacher.
-
-    Arrays have m + 1 rows: the current frame, then the m future ones.
-    """
+    """The motion after the current frame, never shown to a teacher. Arrays have m + 1 rows, the first of this frame."""
 
     indices: tuple[int, ...]  # (m,), of the future frames
     time_s: np.ndarray  # (m + 1,)
@@ -263,8 +260,5 @@ class CaptionConfig(Config):
         return self.window.num_frames * (1 if self.image.layout == "tiled" else len(self.image.modalities))
 
     def recorded(self) -> dict[str, Any]:
-        """Return the settings without places: the kind of the teacher, and whether prompts are the user's own.
-
-        The address of a teacher does not change its answers, and the digests of own files are recorded separately.
-        """
+        """Return the settings without places, which do not change answers; digests of own files are recorded apart."""
         return super().recorded() | {"teacher": self.teacher_kind, "prompts": "own" if self.prompts else None}

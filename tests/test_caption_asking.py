@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter
+from itertools import accumulate
 from pathlib import Path
 
 import pytest
@@ -63,6 +64,8 @@ def test_a_spent_budget_stops_the_run_and_a_larger_one_goes_on(tree, tmp_path, w
             run(settings(server.url, budget=budget, endpoint=few), tree, out)
         assert len(server.bodies) == len(kept_answers(out)) == 32  # what was sent was also kept
         assert not (out / "manifest.json").exists()
+        steps = accumulate(-1 if is_mirror(json.loads(raw)) else 1 for raw in server.bodies)
+        assert max(steps) <= 2  # at most two windows are in work
         num_mirrored = sum(record["purpose"].startswith("mirror") for record in kept_answers(out))
         assert len(list(read_captions(out / "captions.jsonl"))) == num_mirrored > 0
         with pytest.raises(TeacherError, match="captioning stopped"):  # the same budget is not spent twice

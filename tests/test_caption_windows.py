@@ -413,6 +413,12 @@ def in_company(tree):
     return next(cut_windows(dataclasses.replace(flight, goal=GOAL, bystanders=rows), NO_IMAGES)).observed
 
 
+def test_a_track_that_jitters_has_one_velocity(in_company):
+    frames = [dataclasses.replace(f, position_m=(0.0, 0.0, 20.0 + i % 2)) for i, f in enumerate(in_company.frames)]
+    facts = measure_facts(dataclasses.replace(in_company, frames=tuple(frames)))
+    assert (facts.speed_mps, facts.climb_mps) == ((None, None, None, None, 0.0),) * 2
+
+
 def test_a_prompt_tells_the_goal_and_the_others_in_both_languages(in_company):
     prompts = user_prompts(in_company, measure_facts(in_company), RELATIVE)
     assert "\nGoal: follow the woman in the red jacket.\nOther people in view: [0, 1, 2, 3, 3];" in prompts["en"]

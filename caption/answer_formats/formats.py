@@ -1,9 +1,8 @@
 """The answer formats: how a teacher writes its reasons so that their values can be compared with the facts.
 
-Slots: the teacher names facts, and cosfly fills in their values from the window, in both languages. Numbers, units,
-sides, trends and the mirror are right by construction. What a teacher writes outside slots is free; its numbers are
-compared with the facts as those of prose. Prose: the paper's three plain fields, for teachers that write better freely,
-and for texts by somebody else; the numbers with a unit are compared with the facts.
+Slots: the teacher names facts, and cosfly fills in their values from the window, in both languages. Prose: the paper's
+three plain fields, for teachers that write better freely, and for texts by somebody else. Numbers with a unit outside
+slots are compared with the facts.
 """
 
 import re

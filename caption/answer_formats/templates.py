@@ -155,10 +155,8 @@ class Direction(NamedTuple):
 
 
 def _paired(slots: list[Slot], num_frames: int) -> list[Slot]:
-    """Return the slots, marked if a number and a word state the same direction: the word gives the sign.
-
-    A number next to a direction of other frames is refused, since it could be the opposite one.
-    """
+    """Return the slots, marked if a number and a word state the same direction: the word gives the sign. A number next
+    to a direction of other frames is refused, since it could be the opposite one."""
     directions = [_direction_of(slot, num_frames) for slot in slots]
     pairs = list(zip(slots, directions, strict=True))
     of_words = {direction for slot, direction in pairs if direction and slot.is_word}

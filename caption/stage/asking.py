@@ -106,8 +106,7 @@ class Asking:
                         if self.cfg.most_in_flight == 1 and (num_answers := answers.totals["answers"]):
                             answer_s = answers.latency_s / num_answers
                             all_s = duration(answer_s * ANSWERS_PER_WINDOW * sum(guesses))
-                            words = "caption: an answer took %.1f s so far: about %s for %d windows of 2 answers"
-                            log.info(words, answer_s, all_s, sum(guesses))
+                            log.info("caption: an answer took %.1f s: %s for two per window", answer_s, all_s)
                         await self._ask_all(tracks, guesses)
                 if self.progress.windows.input:
                     log.info("caption: %s", self.progress.figures())
@@ -187,9 +186,10 @@ class Asking:
     def _most_in_work(self) -> int:
         """Return how many windows may be in work: about twice the requests at once, so that a slow server finishes
         windows early instead of giving the first answers of many."""
-        num_at_once = self.cfg.most_in_flight if isinstance(self.teacher, AskingTeacher) else self.num_judging
-        if isinstance(self.teacher, AskingTeacher) and isinstance(self.teacher.kept.engine, ChatClient):
-            num_at_once = int(self.teacher.kept.engine.concurrency.limit)
+        engine = self.teacher.kept.engine if isinstance(self.teacher, AskingTeacher) else None
+        num_at_once = max(self.cfg.most_in_flight, self.num_judging)
+        if isinstance(engine, ChatClient):
+            num_at_once = int(engine.concurrency.limit)
         return num_at_once + min(num_at_once, WAITING_WINDOWS)
 
     async def _write_track(self, track: TrackInput, is_cut: bool) -> None:

@@ -58,8 +58,6 @@ def explain_drops(dropped: Mapping[str, int], rejected: Mapping[str, int]) -> st
     texts = [f"{count} {reason}: {REASONS[reason]}" for reason, count in reasons]
     if rejected:
         texts.append(f"rejected answers: {counts_text(most_common(rejected))}")
-    if "invalid_slot" in rejected and "invalid_slot" not in dropped:
-        texts.append(f"invalid_slot: {REASONS['invalid_slot']}")
     return "; ".join(texts)
 
 
@@ -105,7 +103,6 @@ class CaptionReport(BaseModel, extra="forbid"):
     rejected_answers: Counts = Counter()  # of the right structure
     bilingual: Counts = Counter()
     values: dict[str, Counts] = {}  # language -> values_filled, values_matched, values_contradicted
-    contradicted_captions: int = 0
     recovered: Counts = Counter()
     refusals: dict[str, str] = {}  # of dropped windows: code -> last message of a server
     judge_tokens: Usage | None = None  # of all runs into the directory; None if no judge was asked
@@ -140,7 +137,6 @@ class CaptionReport(BaseModel, extra="forbid"):
                 self.judgements[f"overruled_by_{caption.judge.overruled_by}"] += 1
         for language, counts in (checks.values or {}).items():
             self.values.setdefault(language, Counter()).update(counts.model_dump())
-        self.contradicted_captions += checks.contradictions is not None
         self.structure.update([checks.structure] if checks.structure else [])
         self.rejected_answers.update(rejections_of(caption))
         self.bilingual.update([checks.bilingual] if checks.bilingual else [])
@@ -176,9 +172,7 @@ class SampleCards:
         self._kinds: dict[str, list[Caption]] = {}  # dropped, repaired, or the verdict -> captions
 
     def add(self, caption: Caption) -> None:
-        kind = "repaired" if caption.repair else str(caption.verdict)
-        if caption.status == "dropped":
-            kind = "dropped"
+        kind = "dropped" if caption.status == "dropped" else "repaired" if caption.repair else str(caption.verdict)
         cards = self._kinds.setdefault(kind, [])
         cards.append(caption)
         cards.sort(key=lambda card: sha256_bytes(card.sample_id.encode()))

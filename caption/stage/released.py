@@ -78,9 +78,8 @@ def _future(track: ReleasedTrack, motion: LabelMotion, caption: ShownCaption) ->
     """Return the motion after a window; None if the track has no such points."""
     num_future = int(track.settings.get("window", {}).get("future_frames", 5))
     now = caption.frame_index
-    if now < 1 or now + num_future >= len(track.flight):
-        return None
-    if np.isnan(track.flight.positions_m[now - 1 : now + num_future + 1]).any():
+    is_inside = 1 <= now < len(track.flight) - num_future
+    if not is_inside or np.isnan(track.flight.positions_m[now - 1 : now + num_future + 1]).any():
         return None
     return cut_future(track.flight, motion, now, num_future)
 

@@ -24,7 +24,7 @@ from caption.verification.glossary import GLOSSARY_FILE
 from cosfly.formats.captions import caption_lines, line_of, write_caption_lines
 from cosfly.llm.contract import run_until_interrupted
 from cosfly.llm.student_chat import student_files
-from cosfly.runtime.errors import ConfigError, ResumeError, TeacherError
+from cosfly.runtime.errors import ConfigError, TeacherError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import write_model
 from cosfly.runtime.pool import Watch, run_items
@@ -65,6 +65,8 @@ def run(
         unused = {sample_id for sample_id, _ in answers}
     stage = open_stage(cfg, data, out, seed)
     if stage.is_complete and not _continues(stage, cfg, retry_failed):
+        if retry_failed:
+            log.warning("caption: nothing to retry within --limit: other dropped windows would get the same answers")
         _remove_parts(stage)  # the process may have been killed before it removed them
         return out / PRODUCT
     tracks, is_cut = find_inputs(cfg, data)
@@ -166,17 +168,8 @@ def _continues(stage: StageFolder, cfg: CaptionConfig, retry_failed: bool) -> bo
     """Return whether a complete directory is continued: its limit was smaller, or refused windows are asked again."""
     manifest = read_manifest(stage.path)
     limit, limit_before = cfg.limit or math.inf, manifest.facts.get("limit")
-    if limit_before is not None and limit > limit_before:
-        return True
-    if not (retry_failed and read_quarantine(stage.path)):
-        return False
-    if limit < manifest.counts.input:
-        raise ResumeError(
-            "the directory already contains more windows than caption.limit allows", where=stage.path,
-            got=f"{manifest.counts.input} windows", expected=f"at most {cfg.limit} windows",
-            fix="remove or raise --limit",
-        )  # fmt: skip
-    return True
+    is_retried = retry_failed and bool(read_quarantine(stage.path)) and limit >= manifest.counts.input
+    return is_retried or (limit_before is not None and limit > limit_before)
 
 
 # --- embedded teachers ------------------------------------------------------------------------------------------------

@@ -72,10 +72,8 @@ def spread(total: int, count: int) -> list[int]:
 
 
 def find_inputs(cfg: CaptionConfig, data: Path) -> tuple[list[TrackInput], bool]:
-    """Return the tracks of a run in the order of the product, and whether the limit of the settings cuts them.
-
-    A limit takes windows spread over all tracks. They do not depend on the order of work.
-    """
+    """Return the tracks of a run in the order of the product, and whether the limit of the settings cuts them; it takes
+    windows spread over all tracks."""
     folders = find_tracks(data, cfg.flights)
     ids = flight_ids([place_of(folder) for folder in folders])
     tracks = [TrackInput(ids[place_of(folder)], folder) for folder in folders]

@@ -1,7 +1,4 @@
-"""`--try`: a few windows before a run, with all that is asked and answered.
-
-The windows are those of `--limit`. Their answers stay in the journal, so the run does not ask for them again.
-"""
+"""`--try`: a few windows of `--limit` before a run, with all that is asked and answered. The run reuses the answers."""
 
 import asyncio
 import logging
@@ -129,10 +126,8 @@ def _outcome_lines(caption: Caption) -> Iterator[str]:
 
 
 def _question_lines(number: int, request: Request, shown: dict[str, int]) -> Iterator[str]:
-    """Yield the lines of a question; a picture is a line with its number and size.
-
-    A long text of an earlier request of this window is a line with the number of that request; `shown` collects them.
-    """
+    """Yield the lines of a question: for a picture its number and size, for a long text of an earlier request (`shown`)
+    the number of that request."""
     for message in request.messages:
         yield f"--- request {number}, {message['role']} ---"
         content, num_pictures = message["content"], 0

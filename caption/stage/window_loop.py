@@ -98,8 +98,7 @@ class WindowLoop:
     def finish(self, reason: str | None) -> Caption:
         """Return the record of the window, which is dropped if there is a reason."""
         caption = self.caption
-        if caption.teacher.structured != self._structured:
-            caption.teacher = caption.teacher.model_copy(update={"structured": self._structured})
+        caption.teacher = caption.teacher.model_copy(update={"structured": self._structured})
         if english := self.drafts.get("en"):
             caption.en = english.coc
             caption.therefore = english.therefore
@@ -224,11 +223,8 @@ class WindowLoop:
         return await self.regenerate(question)
 
     async def _is_rejected(self, question: Question, judge: Judge) -> bool:
-        """Ask the judge whether an answer in conflict must be asked for again.
-
-        A hard conflict stays one whatever the judge says. A soft one is kept only if the judge accepts it. A label that
-        the judge would put in place of the decision replaces it only if the text does not state another decision.
-        """
+        """Ask the judge whether an answer in conflict must be asked for again; it never excuses a hard one. Its label
+        replaces the decision only if the text does not state another one."""
         english = self.english.coc
         flight_data = question.prompts["en"].filled(replace(question.pictures, views=()).sentence("en")).user
         conflict = Conflict(sample_id=self.caption.sample_id, flight_data=flight_data, answer=english, label=self.label)

@@ -69,12 +69,8 @@ def observe(
     track: Track, frames: tuple[ObservedFrame, ...], span: slice, order: str | None, folders: Sequence[Path] = (),
     files: Sequence[frozenset[str]] = (),
 ) -> ObservedWindow:  # fmt: skip
-    """Return the frames of a span of a track, without a reference to those that follow.
-
-    Args:
-        order: The kind of the mission whose order is in force, if one is.
-        folders: Of all frames, with the names of their files, if there are pictures.
-    """
+    """Return the frames of a span of a track, without a reference to those that follow. order: The kind of the mission
+    in force. folders, files: Of all frames, if there are pictures."""
     goal, current = track.goal, span.stop - 1
     return ObservedWindow(
         sample_id=sample_id(track.flight_id, current), town=track.town, trajectory=track.trajectory,

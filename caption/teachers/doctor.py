@@ -230,17 +230,15 @@ class _Examination:
         endpoint = self.cfg.endpoint
         detail = f"the largest prompt gets no answer within {endpoint.timeout_s:g} s"
         answer_s = endpoint.max_tokens / self.tokens_per_s if self.tokens_per_s else 0.0
-        longer_s = 2 * endpoint.timeout_s
-        shorter = "lower caption.endpoint.max_tokens"
         if self.tokens_per_s:
             speed = f"{self.tokens_per_s:.1f} tokens/s, as in the answer before"
             detail += f"; at {speed}, an answer of {endpoint.max_tokens} tokens takes {answer_s:.0f} s"
             if answer_s < endpoint.timeout_s / 2:
                 detail += ", so it is probably the prompt that takes long to read"
-                shorter = "send smaller pictures (caption.image)" if self.cfg.num_images else ""
-            longer_s = max(longer_s, 2 * answer_s)  # as much again for the prompt
-        fixes = [f"set caption.endpoint.timeout_s={longer_s:.0f}", shorter, "or use a faster server or a smaller model"]
-        self._add("speed", "unusable", f"{detail}; {', '.join(filter(None, fixes))}")
+        longer_s = 2 * max(endpoint.timeout_s, answer_s)  # as much again for the prompt
+        shorter = "lower caption.endpoint.max_tokens, send smaller or no pictures (caption.image)"
+        fix = f"set caption.endpoint.timeout_s={longer_s:.0f}, {shorter}, or use a faster server or a smaller model"
+        self._add("speed", "unusable", f"{detail}; {fix}")
 
     def _report_speed(self, seconds: float) -> None:
         """Report the time of the answer to the largest prompt."""

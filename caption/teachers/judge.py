@@ -108,11 +108,8 @@ async def open_judge(
 
 
 class GoldConflict(Conflict):
-    """A conflict with its right judgement.
-
-    A true caption for another decision than the label is an acceptable alternative; with a planted error it must be
-    written again; a true caption for the label with a changed decision has the wrong label field.
-    """
+    """A conflict with its right judgement: a true caption for another decision than the label, the same with a planted
+    error, or a true caption for the label with a changed decision."""
 
     judgement: Judgement
 

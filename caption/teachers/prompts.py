@@ -138,11 +138,8 @@ _CHANGES = {
 
 
 def _relative_state(facts: Facts, language: Language) -> dict[str, str]:
-    """Return values of the current frame, some of the first frame, and three changes, those of the slot `{change:...}`.
-
-    A direction is a word, because a small student learns a sign badly. There is no value for each frame, because from
-    the same windows it learns less the longer its prompts are.
-    """
+    """Return values of the current frame, some of the first frame, and three changes. A direction is a word, because a
+    small student learns a sign badly, and it learns less from prompts with the values of each frame."""
 
     def written(value: float | None, digits: int, direction: str | None) -> str:
         if value is None:
@@ -205,11 +202,8 @@ def _paper_state(window: ObservedWindow, facts: Facts, language: Language) -> di
 
 
 def question_messages(question: Question, frames: Frames) -> tuple[list[dict], list[str]]:
-    """Return the chat messages of a question and the digests of its pictures.
-
-    The pictures come first, oldest first, each frame under its name, then the flight data: windows of one flight share
-    the system prompt as a prefix and four of five frames as identical pictures.
-    """
+    """Return the chat messages of a question and the digests of its pictures. The pictures come before the flight data:
+    windows of one flight share the system prompt as a prefix and four of five frames."""
     parts = [[{"type": "image_url", "image_url": {"url": image.url}} for image in images] for images in frames]
     table = question.format.table(question.facts)
     text = question.asked["en"].user + ("\n" + table if table else "")
@@ -235,10 +229,8 @@ def mirror_messages(question: Question, english: Draft, complaint: str | None = 
 
 
 def pictures_of(window: ObservedWindow, cfg: ImageConfig) -> Pictures:
-    """Return which pictures of a window are sent: the views of the settings that every observed frame has.
-
-    Public trees can lack depth. If every view of the settings is missing, pixel values refer to the camera's picture.
-    """
+    """Return which pictures of a window are sent: the views of the settings that every observed frame has (public trees
+    can lack depth). If none has, pixel values refer to the camera's picture."""
     in_all_frames = frozenset.intersection(*window.frame_files)
     views = tuple([view for view in cfg.modalities if VIEW_FILES[view] in in_all_frames])
     all_are_missing = bool(cfg.modalities) and not views

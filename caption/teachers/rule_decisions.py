@@ -167,10 +167,8 @@ def _slope(points: Sequence[tuple[float, float]]) -> float:
 
 
 def _closing_m(f: Facts, ahead_m: float, left_m: float) -> float:
-    """Return how much nearer the drone comes to the target, or would if that stood still, whichever is less.
-
-    0 if that is not known. ahead_m, left_m: the drone's expected displacement.
-    """
+    """Return how much nearer the drone comes to the target, or would if that stood still, whichever is less; 0 if that is
+    not known. ahead_m, left_m: the drone's expected displacement."""
     if f.place_m[-1] is None or f.target_velocity_mps is None:
         return 0.0
     x, y, _ = f.place_m[-1]

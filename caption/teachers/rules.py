@@ -1,8 +1,7 @@
 """The embedded rule teacher: deterministic, looks only at the facts measured on the observed frames.
 
 It chooses a decision (rule_decisions.py) and writes English and Chinese templates, whose slots are filled as any other
-teacher's are. A sentence is used only where its condition holds: CONDITIONS names them,
-`rule_sentences.yaml` has the sentences of each. Records say `kind: rules`: it is no model and sees no picture.
+teacher's are. `rule_sentences.yaml` has the sentences of each of the CONDITIONS. It is no model and sees no picture.
 """
 
 import math
@@ -500,11 +499,7 @@ def write_templates(
     facts: Facts, draws: bytes, decision: str | None = None
 ) -> tuple[dict[str, str], dict[str, str]] | None:
     """Write the English and the Chinese answer, with slots for the facts; None if the observed frames hold no reason.
-
-    Args:
-        draws: random bytes, at least 24.
-        decision: to justify (anchored); None takes the strongest one that has a reason.
-    """
+    draws: At least 24 random bytes. decision: To justify (anchored); None takes the strongest one that has a reason."""
     choose = Chooser(facts, draws)
     for token in [decision] if decision else ranked(facts):
         side = ("left" in token) - ("right" in token)
@@ -525,11 +520,8 @@ def write_templates(
 
 
 def _critical_components(choose: Chooser, side: int) -> list[SentencePair]:
-    """Return the facts on which a decision rests, in no fixed order.
-
-    They hardly depend on the decision: what tells one manoeuvre from another is how the nose turns, how the drone
-    climbs and moves, and how the target moves. A student that writes them has read what it needs before it decides.
-    """
+    """Return the facts on which a decision rests, in no fixed order. They hardly depend on the decision, so that a student
+    that writes them has read what it needs before it decides."""
     topics = TOPICS if choose.facts.is_visible_now else TOPICS_HIDDEN
     if choose.facts.mission:
         topics = TOPICS_ORDERED

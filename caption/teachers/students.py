@@ -29,10 +29,7 @@ from cosfly.viz.frame_views import Pictures
 
 
 def student_settings(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfig:
-    """Return settings whose windows, pictures, answer format and sampling are those of the student's training.
-
-    Without a student the settings do not change.
-    """
+    """Return settings whose windows, pictures, answer format and sampling are those of the student's training, if any."""
     folder = cfg.student.folder
     if folder is None:
         return cfg
@@ -75,10 +72,8 @@ def check_prompts(chat_format: ChatFormat, folder: Path, vocabulary: Vocabulary)
 
 
 def _is_of_template(user: str, language: Language, chat_format: ChatFormat, vocabulary: Vocabulary) -> bool:
-    """Return whether a question is the template of its language, filled with the student's pictures.
-
-    The template becomes a pattern: its slots are first marked by \\0, because re.escape would change a pattern in them.
-    """
+    """Return whether a question is the template of its language, filled with the student's pictures. The template
+    becomes a pattern: \\0 marks its slots, because re.escape would change a pattern in them."""
     template = vocabulary.templates[f"user_{language}"]
     looks = [Pictures(look.views, look.size_px, "separate", look.depth_range_m) for look in chat_format.looks]
     patterns = {

@@ -137,9 +137,8 @@ def _rules(t: Thresholds) -> tuple[dict[str, Rule], ...]:
         return rule(lambda m: m.yaw_deg / (side * t.yaw_deg), least=-1.0)
 
     def strafe(side: int) -> Rule:
-        """Return the rule of a shift to one side. A drone that swings around the person shifts to one side and turns to
-        the other to keep its aim. That is one motion, a turn to follow; which of its two parts has the larger size
-        depends on the distance alone (1 m is 3 degrees at 19 m)."""
+        """Return the rule of a shift to one side. With a turn to the other side, as of a drone that swings around the
+        person, it is one motion, a turn to follow."""
 
         def shown(m: Motion) -> float:
             return m.left_m / (side * t.lateral_m)

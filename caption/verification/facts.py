@@ -231,13 +231,9 @@ def _weighted(weights: Weights, values: Sequence[float]) -> float:
 def _velocities(
     axes: Sequence[Sequence[float]], known: tuple[bool, ...], step_s: float, smooth: float
 ) -> tuple[list[float], list[list[float]]]:
-    """Return the slope of each axis over the whole window, and of each axis at each frame, NaN if that is not known.
-
-    Args:
-        axes: for each axis its values at the frames; a velocity is their slope per second.
-        smooth: the largest root mean square deviation from a parabola, in units of the axes, of a track without jitter;
-            beyond it the current frame alone has a velocity, that of the whole window.
-    """
+    """Return the slope per second of each axis over the whole window, and at each frame, NaN if that is not known. A
+    track jitters if it deviates from a parabola by more than `smooth`, as a root mean square in units of the axes; then
+    the current frame alone has a velocity, that of the whole window."""
     fit = _fit_of(known)
     if not all(known):  # a weight of 0 does not hide NaN
         axes = [[value if is_known else 0.0 for value, is_known in zip(axis, known, strict=True)] for axis in axes]

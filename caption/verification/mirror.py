@@ -17,11 +17,8 @@ TEXTS = ("critical_components", "reasoning_trace")
 
 
 def check_mirror(english: Coc, chinese: Coc, facts: Facts) -> str | None:
-    """Compare two languages of one sample; return the reason of a mismatch, None where they agree.
-
-    Each number of one language must occur in the other, in the measured series, or be a difference of two such numbers
-    of the same unit. An opposite is swapped where one of its sides is lost and the other one gained in the translation.
-    """
+    """Compare two languages of one sample; return the reason of a mismatch, None where they agree. Each number of one
+    language must occur in the other, in the measured series, or be a difference of two such numbers of its unit."""
     if english.flight_decision != chinese.flight_decision:
         return "decision"
     texts_en, texts_zh = _texts(english), _texts(chinese)

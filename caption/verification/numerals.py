@@ -68,7 +68,6 @@ def read_numerals(text: str, language: Language) -> list[Numeral]:
         bound = -1 if stands_at("less", before, after, language) else 0
         if stands_at("more", before, after, language):
             bound = 1
-        is_about = stands_at("about", before, after, language)
-        written = match.group().strip()
+        is_about, written = stands_at("about", before, after, language), match.group().strip()
         numerals.append(Numeral(written, value * factor, unit, digits, factor, bound, is_about, match.start()))
     return numerals

@@ -293,11 +293,8 @@ def has_sides(name: str) -> bool:
 
 
 def trend_of(quantity: Quantity, values: Sequence[float]) -> str:
-    """Return the trend of a series: increasing, decreasing, steady or mixed.
-
-    It increases or decreases if all steps do, or if the straight line that fits it best changes by more than the steady
-    band and by more than CLEAR_RATIO times the deviation from that line.
-    """
+    """Return the trend of a series: increasing or decreasing if all steps are, or if the straight line that fits best
+    changes by more than the steady band and by more than CLEAR_RATIO times the deviation from it; else steady or mixed."""
     band = max(quantity.steady, quantity.steady_share * max(map(abs, values)))
     if max(values) - min(values) <= band:
         return "steady"

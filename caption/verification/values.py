@@ -67,11 +67,8 @@ def _clause_around(sentence: str, numeral: Numeral, language: Language) -> str:
 
 
 def named_quantity(clause: str, numeral: Numeral, language: Language) -> str:
-    """Return the one quantity with which a number is compared, as its clause names it; "" where it is not clear.
-
-    A speed is of the drone or of the target where one of them alone is named, before the number. A clause that compares
-    may give a difference.
-    """
+    """Return the one quantity with which a number is compared, as its clause names it; "" where it is not clear, as for a
+    speed after the names of both drone and target, or in a clause that compares."""
     if numeral.unit == "mps":
         subjects = mentioned("subjects", clause, language)
         before = clause[: max(0, clause.find(numeral.text))]
