@@ -298,8 +298,7 @@ def parts_of(body: dict) -> list[dict]:
     return [part for one in contents for part in ([{"text": one}] if isinstance(one, str) else one)]
 
 
-# A sound endpoint. cuts: prompts to so many tokens, in silence. shortens: the answer to fit the context, in silence. status: of a refusal for too many pictures.
-# in_parts: the answer is a list of parts. takes_null: where a field may be null.
+# A sound endpoint. cuts: prompts to so many tokens, in silence. shortens: the answer to fit the context, in silence. status: of a refusal for too many pictures. in_parts: the answer is a list of parts. takes_null: where a field may be null.
 SOUND = {
     "obeys_schema": True, "refuses_schema": False, "max_images": 15, "sees_images": 99, "thinks": False, "counts": True,
     "context": CONTEXT, "shortens": False, "empty": False, "status": 400, "in_parts": False, "takes_null": True,
@@ -376,6 +375,7 @@ DEFECTS = [
     ({"has_system": False}, "system role", "warning", "sent with the question"),
     ({"most_bytes": 300_000}, "image input", "unusable", "the request has 0.9 MB"),
     ({"context": 6000, "shortens": True}, "context length", "unusable", "more than 6000"),
+    ({"context": 6000, "shortens": True}, "answer length", "warning", "raise this limit (a good answer"),
     ({"empty": True}, "answers", "unusable", "an empty answer"),
     ({"empty": True, "thinks": True}, "answers", "unusable", "enable_thinking: false"),
 ]

@@ -205,7 +205,7 @@ class _Examination:
             await self._check_context(trial.prompt_tokens)
             if trial.reply.cut_advice:
                 limit = f"caption.endpoint.max_tokens={endpoint.max_tokens}"
-                fix = f"{trial.reply.cut_advice}; a good answer takes about 200 tokens"
+                fix = f"{trial.reply.cut_advice} (a good answer takes about 200 tokens)"
                 self._add("answer length", "warning", f"the answer is cut at {limit}: {fix}")
             self._report_speed(trial.seconds)
         elif trial.seconds >= endpoint.timeout_s:
