@@ -272,8 +272,8 @@ class Asking:
         self.rejected.update(rejections_of(caption))
         if self.dropped.total() == limit:
             what = f"none of the first {limit} windows was accepted"
-            see = f"to see why, read {self.stage.path / ANSWERS}/*.jsonl or run `cosfly caption doctor`"
-            fix = f"{see}; to continue anyway, pass --set caption.stop_after_dropped=0"
+            see = f"to see why, open {self.stage.path / 'report.html'}; use a larger model"
+            fix = f"{see}, or to continue anyway, pass --set caption.stop_after_dropped=0"
             got = explain_drops(self.dropped, self.rejected)
             raise TeacherError(what, where=self.cfg.teacher, got=got, fix=fix)
 
