@@ -19,7 +19,7 @@ from caption.stage.window_loop import caption_window
 from caption.teachers.judge import Judge, open_judge
 from caption.teachers.prompt_files import Vocabulary
 from caption.teachers.teacher import AskingTeacher, Teacher, open_teacher
-from cosfly.formats.captions import Caption, Usage, write_captions
+from cosfly.formats.captions import Caption, Usage, read_captions, write_captions
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook, Budget, BudgetSpent
 from cosfly.llm.client import ChatClient
@@ -90,23 +90,23 @@ class Asking:
         """Ask about every window that has no answer yet; TeacherError if no window would get one. Answers are kept."""
         path = self.stage.path
         guesses = [track.guess_num_windows(self.cfg.window) for track in tracks]
+        total = sum(guesses)
         try:
             with AnswerBook(path / ANSWERS) as answers, AnswerBook(path / JUDGEMENTS) as judgements:
                 self.books = (answers, judgements)
-                # Requests to both may be in flight when a limit of the budget is reached.
-                most_in_flight = self.cfg.most_in_flight + self.num_judging
+                most_in_flight = self.cfg.most_in_flight + self.num_judging  # when a limit of the budget is reached
                 budget = Budget(self.cfg.budget, most_in_flight, answers.totals, judgements.totals)
-                with progress_bar("caption", sum(guesses)) as advance:
+                with progress_bar("caption", total) as advance:
                     async with (
                         open_teacher(self.cfg, answers, self.seed, budget, self.retried) as teacher,
                         open_judge(self.cfg.judge, self.vocabulary, self.seed, judgements, budget) as judge,
                     ):
                         self.teacher, self.judge = teacher, judge
-                        self.progress = RunProgress(advance, sum(guesses), budget)
+                        self.progress = RunProgress(advance, total, budget)
                         if self.cfg.most_in_flight == 1 and (num_answers := answers.totals["answers"]):
                             answer_s = answers.latency_s / num_answers
-                            all_s = duration(answer_s * ANSWERS_PER_WINDOW * sum(guesses))
-                            log.info("caption: an answer took %.1f s: %s for two per window", answer_s, all_s)
+                            what = "caption: answers took %.1f s each; two for each of %d windows take about %s"
+                            log.info(what, answer_s, total, duration(answer_s * ANSWERS_PER_WINDOW * total))
                         await self._ask_all(tracks, guesses)
                 if self.progress.windows.input:
                     log.info("caption: %s", self.progress.figures())
@@ -134,7 +134,7 @@ class Asking:
                     if part.exists() and track.name in self.retried_tracks:  # it is unfinished again
                         part.replace(track.gap(self.stage.path))
                     if part.exists():
-                        self._skip_finished(guess)
+                        self._skip_finished(part, guess)
                     elif not self.outcome.stopped:
                         await self._ask_track(track, tasks)
         except BaseExceptionGroup as errors:
@@ -147,9 +147,10 @@ class Asking:
                 except (CosflyError, OSError) as error:  # the run already ends with another error
                     log.error("caption: %s: %s", track.name, error)
 
-    def _skip_finished(self, num_windows: int) -> None:
+    def _skip_finished(self, part: Path, num_windows: int) -> None:
         """Count a track that an earlier run finished."""
-        self.has_accepted = True  # most probably
+        if not self.has_accepted:
+            self.has_accepted = any(caption.status == "accepted" for caption in read_captions(part))
         self.outcome.tracks.input += 1
         self.outcome.tracks.kept += 1
         self.progress.skip(num_windows)
