@@ -146,22 +146,23 @@ def test_numbers_and_sizes_of_a_prompt_are_respected():
     assert np.ptp(town.boxes.bounds(), axis=0)[:2] == pytest.approx([300.0, 200.0], abs=0.5)
     assert town.boxes.maxs[of_kinds(town.boxes, "Buildings"), 2].max() <= 8.0
     assert (trace["not_used"], trace["not_respected"]) == ([], [])
-    assert {"12 detached houses", "2 fountains", "300 m x 200 m", "suburb"} <= set(trace["used"])
+    assert {"12 detached houses", "2 fountains", "300 m x 200 m (size)", "suburb"} <= set(trace["used"])
     assert all(one["is_met"] for one in check_world(town, plan) if one["check"].startswith(("number", "highest")))
 
 
 def test_what_is_not_respected_is_named_in_the_report_and_in_one_line(tmp_path, caplog):
-    prompt = "an airport with a control tower, 90 detached houses, 50 m x 100 m, streets 2 m wide, a purple windmill"
+    prompt = "an airport with a control tower, 90 detached houses, 70 m x 400 m, streets 2 m wide, a purple windmill"
     run(WorldConfig(prompt=prompt), tmp_path / "w")
     checks = read_json(tmp_path / "w/checks.json", what="checks")
-    assert checks["words_not_used"] == ["streets 2 m wide", "airport", "control tower", "purple"]
-    size, number = checks["not_respected"]
-    assert size == "size of the town, m: 50 is said, 80 is possible"
-    assert number.startswith("number of houses (")
-    assert [one["is_met"] for one in checks["checks"] if one["check"] == "number of houses"] == [False]
+    assert checks["words_not_used"] == ["airport", "control tower", "purple"]
+    width, size, number = checks["not_respected"]
+    assert width == "width of a street, m: 2 is said, 5 is possible"
+    assert size == "size of the town, m: 70 is said, 80 is possible"
+    assert number.startswith("number of buildings (house)")
+    assert [one["is_met"] for one in checks["checks"] if one["check"].startswith("number")] == [False]
     (line,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert all(
-        name in line for name in ("streets 2 m wide, airport, control tower", "size of the town", "number of houses")
+        name in line for name in ("airport, control tower", "width of a street", "size of the town", "number of build")
     )
     assert plan_by_rules(prompt, 0)[0].heights_m[1] < 20.0  # a control tower makes no city of towers
 
@@ -232,19 +233,26 @@ def test_worlds_go_on_to_releases_with_the_settings_that_are_told(tmp_path, in_t
         assert f"seed: {5 + number}\n" in (run_folder / "run.yaml").read_text()
 
 
-def test_the_width_of_a_street_sets_no_height():
-    width = "streets of at most 12 m"
-    plain, named = (plan_by_rules(f"a town with {words} and houses", 0) for words in ("streets", width))
-    assert named[0].heights_m == plain[0].heights_m
-    assert named[0].buildings == plain[0].buildings
-    assert width in named[1]["not_used"]
+def test_a_measure_is_of_what_its_noun_stands_for(tmp_path):
+    plan, trace = plan_by_rules(
+        "a town of 300 m x 200 m with streets of at most 12 m, two-storey houses, a 20 m tall factory, towers between 40 and "
+        "60 m, a square 40 m across, a 30 m high church and a river 25 m wide", 0
+    )  # fmt: skip
+    assert (plan.size_m, plan.street_m, plan.river_m) == ((300.0, 200.0), 12.0, 25.0)
+    assert {kind.name: kind.heights_m for kind in plan.buildings} == {
+        "house": (3.6, 6.0), "factory": (19.1, 20.0), "tower": (40.0, 60.0),
+    }  # fmt: skip
+    assert plan.heights_m == by_rules("a town").heights_m
+    assert trace["not_used"] == ["40 m across", "30 m high"]
+    with pytest.raises(InputError, match=r"no room for a building.*80 m x 80 m"):
+        run(WorldConfig(prompt="an old town of 80 m x 80 m with a castle"), tmp_path / "w")
 
 
 @pytest.mark.parametrize(
     ("prompt", "houses_m"),
     [
         ("a town with houses, at most 12 m high, and a lighthouse", 12.0),
-        ("a town with houses of two or three storeys and a lighthouse", 9.6),
+        ("a town with houses of two or three storeys and a lighthouse", 9.0),
         ("a town with a lighthouse. No building except the lighthouse is higher than 12 m", 12.0),
         ("a town with buildings at most 12 m high, but the church is higher", 12.0),
     ],
@@ -283,7 +291,7 @@ def test_words_after_no_are_used_only_if_they_change_something():
 def test_a_few_counted_buildings_stand_among_others():
     for prompt, is_whole in (("an old town with a warehouse", False), ("a suburb with 2 apartment blocks", False),
                              ("a hamlet of 4 cottages", True), ("a port with 12 warehouses", False),
-                             ("an industrial park with 12 warehouses", True)):  # fmt: skip
+                             ("an industrial park of 12 warehouses", True)):  # fmt: skip
         assert by_rules(prompt).only_these == is_whole, prompt
 
 

@@ -37,7 +37,7 @@ FIELD_BOUNDS = {
 }  # fmt: skip
 SEVERAL, SEVERAL_OPEN = 4, 3  # objects, and open blocks, of a plural without a number
 FEW = 5  # fewer buildings than that are not a whole town, but stand among others
-STOREY_M = 3.2
+STOREY_M = 3.0
 VARIED = {"blocks_along": (0.92, 1.08), "block_m": (0.85, 1.2), "gap_m": (0.92, 1.08)}  # range of random factors
 LOWEST_M, HIGHEST_M = 3.0, 450.0  # buildings of a plan
 LOW_TOWN_M = 16.0  # highest building of a town without high-rises
@@ -46,30 +46,22 @@ LINEAR_DEPTH = 2.4  # depth of a linear town of a given length, in blocks
 # Patterns of the text, which is in lower case with numbers in digits, each with an example.
 _NUMBER = r"(\d+(?:\.\d+)?)"
 _LENGTH = r"(km|kilomet(?:er|re)s?|m|metres?|meters?)\b"
-_HEIGHT = (  # "12 m", "3-storey", but not the "12 m" of "12 m wide"
+_HEIGHT = (  # "12 m", "3-storey", "8 m wide", but not the "12 m" of "12 m long"
     rf"(?P<number>{_NUMBER})[ -]?(?P<unit>m|metres?|meters?|floors?|storeys?|stor(?:y|ies)|levels?)\b"
-    r"(?! (?:wide|long|x|by))(?: high| tall| in height)?"
-)
-# A width, which is not used: "12 m wide", "streets of at most 20 m", "a river of 30 to 40 m"
-_WIDTH = (
-    r"\b((?:street|road|lane|alley|avenue|boulevard|pavement|sidewalk|footpath|path|promenade|river|canal)s?)"
-    r"(?: (?:width|are|is|of|between|at most|at least|up to|about|over|under|more than|less than))* "
-    rf"(?:\d+ ?(?:m )?(?:to|and|-) ?)?{_NUMBER} ?{_LENGTH}(?: wide| in width)?|{_NUMBER} ?{_LENGTH}[- ]wide\b"
+    r"(?! (?:long|x|by|apart|away|deep|thick|from|in diameter)\b)"
+    r"(?: high| tall| in height|(?P<wide>[ -]wide| in width))?"
 )
 _HEIGHTS = {
     # "no building is higher than 20 m", "up to 3 floors"
-    "at_most": r"(?:(?:no|none|not|nothing)(?: \w+)?(?: is| are)? (?:higher|taller|more|over|above)(?: than)?|under"
-               rf"|below|at most|up to|max(?:imum)?\.?(?: height)?(?: of)?|limited to) {_HEIGHT}",
+    "at_most": r"(?:(?:no|none|not|nothing)(?: (?P<what>\w+?)s?)?(?: is| are)? (?:higher|taller|more|over|above)"
+               rf"(?: than)?|under|below|at most|up to|max(?:imum)?\.?(?: height)?(?: of)?|limited to) {_HEIGHT}",
     "or_less": rf"{_HEIGHT},? (?:at most|or less|or lower|maximum|at the most)",  # "20 m high or less"
     # "4 to 6 m", "between 10 m and 5 floors"
     "between": rf"(?:\b(?:between|from) )?\b(?P<low>{_NUMBER}) ?(?:m|metres?|meters?)? ?(?:and|to|or|-) {_HEIGHT}",
     "at_least": rf"(?:at least|more than|over|above|minimum) {_HEIGHT}",  # "over 40 m tall"
     "exactly": _HEIGHT,  # "3-storey"
 }  # fmt: skip
-# Before a height of one building: "a 40 m tower", "a church whose tower is 30 m tall", "some of them 10 floors high"
-_OF_ONE = re.compile(
-    r"(?:\b(?:an?|whose [\w-]+(?: [\w-]+)? (?:is|are)|(?:some|one|a few|\d+) of (?:them|which)(?: are| is)?)) $"
-)
+_OF_SOME = re.compile(r"\b(?:some|one|a few|\d+) of (?:them|which)(?: are| is)? $")  # "some of them 10 floors high"
 _SIZES = {
     "sides": rf"{_NUMBER} ?(?:{_LENGTH})? ?(?:x|×|by|times) ?{_NUMBER} ?{_LENGTH}",  # "600 x 400 m"
     "square": rf"{_NUMBER} ?{_LENGTH} (?:square\b|across|on (?:a|each) side)",  # "500 m across"
@@ -100,6 +92,8 @@ FIELDS: dict[str, set[str]] = defaultdict(
     water={"river_m"},
     other=set(),
 )
+# Widths: target -> field, and the possible range, m.
+WIDTHS = {"street": ("street_m", 5.0, 40.0), "avenue": ("avenue_m", 5.0, 60.0), "water": ("river_m", 4.0, 100.0)}
 OF_ANY = ("vegetation", "cars")  # groups of adjectives that describe the town, unless a noun follows
 ADJECTIVES = {
     word: (group, choice)
@@ -118,7 +112,7 @@ NOUNS = {
     **dict.fromkeys(SETTLEMENT_NOUNS, "town"),
 }
 _TOKEN = re.compile(
-    rf"(?P<end>[.,;:()]|(?<![\w-])(?:{'|'.join(_words(WORDS['ends']))})(?![\w-]))"
+    rf"#(?P<measure>\d+)#|(?P<end>[.,;:()]|(?<![\w-])(?:{'|'.join(_words(WORDS['ends']))})(?![\w-]))"
     rf"|(?<![\w-])(?:(?P<known>{'|'.join(_longest_first([*ADJECTIVES, *NOUNS]))})(?:e?s)?|(?P<word>[\w-]+))(?![\w-])"
 )
 
@@ -129,6 +123,7 @@ class _Phrase:
     def __init__(self, end: str) -> None:
         self.ends = [end]  # what is before it
         self.adjectives = list[tuple[int, str]]()  # with their places in the text
+        self.measures = list[int]()  # their numbers
         self.nouns = list[str]()
         self.words = set[str]()  # all others
 
@@ -143,7 +138,9 @@ def _phrases(text: str) -> list[_Phrase]:
     phrases = [_Phrase(".")]
     for match in _TOKEN.finditer(text):
         phrase = phrases[-1]
-        if match["end"] and not (phrase.adjectives or phrase.nouns or phrase.words):
+        if match["measure"]:
+            phrase.measures.append(int(match["measure"]))
+        elif match["end"] and not (phrase.adjectives or phrase.nouns or phrase.words or phrase.measures):
             phrase.ends.append(match["end"])
         elif match["end"]:
             phrases.append(_Phrase(match["end"]))
@@ -161,7 +158,22 @@ def _nearby_noun(phrases: list[_Phrase], number: int) -> str:
     for after in phrases[number + 1 : number + 2]:
         if after.nouns and {",", "and"}.issuperset(after.ends) and not {"a", "an", "the"} & after.words:
             return after.head
+    return _noun_before(phrases, number)
+
+
+def _noun_before(phrases: list[_Phrase], number: int) -> str:
     return next((phrase.head for phrase in reversed(phrases[:number]) if phrase.nouns), "")
+
+
+def _noun_of_measure(phrases: list[_Phrase], number: int, name: str, match: re.Match[str]) -> str:
+    """Return the noun of a measure in a phrase: of the phrase, or in a phrase without one, the noun before it."""
+    phrase = phrases[number]
+    if name == "at_most" and match[0].startswith(("no", "none", "nothing")):
+        return match["what"] if match["what"] in NOUNS else ""  # "no house is higher than 8 m"
+    if phrase.head:
+        return phrase.head
+    is_of_town = "." in phrase.ends or (name in _SIZES and "of" not in phrase.ends)
+    return "" if is_of_town else _noun_before(phrases, number) or _nearby_noun(phrases, number)
 
 
 def _target(group: str, noun: str) -> str:
@@ -181,7 +193,7 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
 
 def _normalized(prompt: str) -> str:
     """Return a prompt in lower case with numbers in digits, and with one word for phrases such as "few trees"."""
-    text = prompt.lower().replace("’", "'")
+    text = prompt.lower().replace("’", "'").replace("#", " ")  # "#" marks measures
     for words in _longest_first(WORDS["amounts"]):
         amount = WORDS["amounts"][words]  # "hardly any greenery" becomes the word "few-trees" of the choices
         text = re.sub(rf"\b{words} (?:trees|vegetation|greenery)\b", f"{amount}-trees", text)
@@ -191,6 +203,7 @@ def _normalized(prompt: str) -> str:
     for plain, pattern in (
         # "a church whose tower": a part of it, which is not used
         (r"\1 steeple", r"\b((?:church|chapel|cathedral|castle)(?: (?!and\b)[\w-]+){1,4})(?<!clock)(?<!bell) tower\b"),
+        ("lakeside", r"\b(?:shores?|banks?|edge) of (?:a|the) (?:\w+ )?lake\b|\blake ?(?:shore|front)\b"),
         ("industrial", r"\bindustrial (?:park|estate)\b"), (r"\1-park", r"\b(business|logistics) park\b"),
         (r"\1public park", r"^((?:an? |the )?(?:[\w-]+ ){0,2})(?<!car )park\b"),  # not the one of "a city with a park"
         ("1-stor", r"\bsingle[- ]stor"), ("hotel-buildings", r"(?<!\d )\bhotels\b"),
@@ -222,8 +235,10 @@ class _Reader:
         self.not_used: list[str] = []
         self.not_respected: list[str] = []
         # What is read by `_take_phrases`.
+        self.measures = list[tuple[str, re.Match[str]]]()  # with their names in _SIZES and _HEIGHTS
         self.sizes: dict[str, re.Match[str]] = {}  # of the town, by name in _SIZES
-        self.heights: dict[str, re.Match[str]] = {}  # of buildings, by name in _HEIGHTS
+        # By name in _HEIGHTS, of each target: heights of all buildings ("town") or one kind, widths of the others.
+        self.limits: dict[str, dict[str, re.Match[str]]] = {}
         self.absent = ""  # what there is not, such as "towers, "
         self.objects: dict[str, int] = {}  # counts
         self.buildings: dict[str, int | None] = {}  # counts by kind; None for a plural without a number
@@ -251,11 +266,12 @@ class _Reader:
             fix = "name a kind of place, or use a language model with --planner URL"
             raise InputError(what, where="PROMPT", got=repr(self.prompt[:60]), expected=expected, fix=fix)
         self.plan["pattern"] = self.pattern or settlement["patterns"][seed % len(settlement["patterns"])]
-        self._set_buildings(settlement, has_open)
+        self._set_buildings(has_open)
         # The seed varies what settlement and choices set; then comes what the prompt measures, which does not vary.
         for name, factors in VARIED.items():
             self.plan[name] = _scaled(self.plan[name], rng_for(seed, "world", name).uniform(*factors))
         self._set_heights()
+        self._set_widths()
         self._set_size()
         if re.search(r"\bbuildings?\b", self.absent) and not self.buildings:
             self.plan["only_these"] = True
@@ -264,7 +280,7 @@ class _Reader:
         for name, (low, high) in FIELD_BOUNDS.items():
             self.plan[name] = min(high, max(low, self.plan[name]))
         self.plan["objects"] = [{"name": name, "count": count} for name, count in self.objects.items()]
-        self.plan["not_used"] = [*self.not_used, *self._left_over()]
+        self.plan["not_used"] = [*dict.fromkeys([*self.not_used, *self._left_over()])]
         plan = WorldPlan.model_validate(self.plan)
         trace = {
             "planner": "rules", "settlement": place, "settlement_is_named": bool(self.named or any(implied)),
@@ -287,11 +303,6 @@ class _Reader:
             if keep == ",":
                 self.used.append(match[0].strip())
         return match
-
-    def _take_named(self, patterns: dict[str, str]) -> dict[str, re.Match[str]]:
-        """Take the first match of each pattern; return the matches by the names of the patterns."""
-        matches = {name: self._take(pattern) for name, pattern in patterns.items()}
-        return {name: match for name, match in matches.items() if match is not None}
 
     def _take_words(self, words: str, meaning: str = "") -> None:
         """Take all of some words, singular or plural; meaning: what they were used for, if that is not plain."""
@@ -318,25 +329,16 @@ class _Reader:
 
     def _take_phrases(self) -> None:
         """Take measures and nouns. Each is taken before those that would misread it."""
-        # Measures are before nouns, which their numbers do not count.
-        self.sizes = self._take_named(_SIZES)
-        while match := self._take(_WIDTH, keep=r"\1 ,"):  # before heights and the word "wide", which would misread it
-            self.not_used.append(match[0].strip())
-        self.heights = self._take_named(_HEIGHTS)
-        if "exactly" in self.heights and _OF_ONE.search(
-            self.heights["exactly"].string[: self.heights["exactly"].start()]
-        ):
-            self.not_used.append(self.heights.pop("exactly")[0].strip())
-        limits = [name for name in self.heights if name != "at_least"]
-        for name in limits[1:]:  # only the first limits the highest building
-            self.not_used.append(self.heights.pop(name)[0].strip())
+        for name, pattern in (_SIZES | _HEIGHTS).items():  # before nouns, which their numbers do not count
+            while match := self._take(pattern, keep=f"#{len(self.measures)}#"):
+                self.measures.append((name, match))
         while match := self._take(_CARS):  # before the words of cars: "5 parked cars" are not many
             self.not_used.append(match[0].strip())
         while match := self._take(_ABSENT):  # before the nouns: "without towers" names no tower
             self.absent += f"{match[1].strip()}, "
             if not _HAS_EFFECT.search(match[1]):
                 self.not_used.append(match[0].strip())
-        self._take_adjectives()
+        self._attach_words()
         self.objects = self._take_objects()  # before buildings: a clock tower is no tower
         for word in _words(WORDS["lacking"]):  # before buildings: a control tower is none either
             if match := self._take(rf"(?:\b\d+ )?\b{word}s?\b"):
@@ -367,12 +369,14 @@ class _Reader:
                 counts[name] = self._within(f"number of {name}s", count, 1, 1000) if count else None
         return counts
 
-    def _take_adjectives(self) -> None:
-        """Take the adjectives that change what their noun stands for; set their choices and the named settlement."""
+    def _attach_words(self) -> None:
+        """Find the named settlement, and take the measures and adjectives for what their nouns stand for."""
         phrases = _phrases(self.text)
-        for phrase in phrases:
+        for number, phrase in enumerate(phrases):
             if not self.named and phrase.head in SETTLEMENT_NOUNS:
                 self.named = next((name for name, words in SETTLEMENTS.items() if words & {*phrase.nouns}), None)
+            for name, match in (self.measures[k] for k in phrase.measures):
+                self._attach_measure(name, match, _noun_of_measure(phrases, number, name, match))
         taken = list[tuple[int, int]]()
         for number, phrase in enumerate(phrases):
             for start, word in phrase.adjectives:
@@ -387,10 +391,33 @@ class _Reader:
                 taken.append((start, start + len(word)))
         for start, end in reversed(taken):
             self.text = self.text[:start] + self.text[end:].removeprefix(" ")  # "30 small houses" are 30 houses
+        self.text = re.sub(r" *#\d+# *", " ", self.text)
+
+    def _attach_measure(self, name: str, match: re.Match[str], noun: str) -> None:
+        """Take a measure as the size of the town, as a limit of heights, or as the width of streets or water."""
+        target = NOUNS.get(noun, "other") if noun else "town"
+        if target == "building":
+            target = "town"
+        is_width = target in WIDTHS
+        if name in _SIZES:
+            is_used = target == "town" or (name == "length" and is_width)
+            chosen = self.sizes
+        else:
+            is_metres = match["unit"].startswith("m")
+            is_used = target != "other" and (is_metres if is_width else not match["wide"])
+            is_used = is_used and not _OF_SOME.search(match.string[: match.start()])
+            chosen = self.limits.setdefault(target, {}) if is_used else {}
+            if name != "at_least" and chosen.keys() - {"at_least"}:  # only the first limits the highest building
+                is_used = False
+        if is_used and name not in chosen:
+            chosen[name] = match
+            self.used.append(f"{match[0].strip()} ({'size' if name in _SIZES else noun or 'all buildings'})")
+        else:
+            self.not_used.append(match[0].strip())
 
     def _take_open_and_water(self) -> bool:
         """Take words of open blocks and of water, and set both; return whether open blocks are named."""
-        text_before = self.text
+        named = set[str]()
         has_river = bool({"bridge", "footbridge"} & {*self.objects}) or self._has(WORDS["rivers"])
         for word, width_m in WORDS["water"].items():
             if self._has(word):
@@ -403,9 +430,12 @@ class _Reader:
             # "Houses with gardens" means no several blocks.
             count = self._take_counted(word, plural_count=1 if word in ("garden", "lawn") else SEVERAL_OPEN)
             if count is not None:
+                named.add(field)
                 most = 20 if field == "plazas" else 40  # as in WorldPlan
                 self.plan[field] = max(self.plan[field], self._within(f"number of {word}s", count, 1, most))
-        has_open = self.text != text_before
+        has_open = bool(named)
+        if has_open:  # what the settlement has without being asked
+            self.plan |= dict.fromkeys({"plazas", "greens"} - named, 0)
         self._take_words(",".join(WORDS["water"]))
         num_bridges = self.objects.get("bridge", 0) + self.objects.get("footbridge", 0)
         if re.search(r"\bbridges?\b", self.absent):
@@ -446,8 +476,8 @@ class _Reader:
                 if name in FIELDS[target] and name in fields:
                     fields[name] = _scaled(fields[name], factor)
 
-    def _set_buildings(self, settlement: dict[str, Any], has_open: bool) -> None:
-        """Set the kinds of buildings. Where one that the settlement consists of is counted, there are no others."""
+    def _set_buildings(self, has_open: bool) -> None:
+        """Set the kinds of buildings, and whether there are no others."""
         counts = [count for count in self.buildings.values() if count is not None]
         is_of_them = any(f" of {count} " in self.normalized for count in counts)
         for name, count in self.buildings.items():
@@ -463,36 +493,41 @@ class _Reader:
             if count is None and "gap_m" in row:
                 self.plan["gap_m"] = row["gap_m"]
             self.plan["buildings"].append(group)
-            is_main = not row.get("landmark") or name in _words(settlement.get("consists_of", ""))
-            if None not in self.buildings.values() and (is_of_them or (is_main and sum(counts) >= FEW)):
+            is_main = not row.get("landmark") and sum(counts) >= FEW
+            if None not in self.buildings.values() and (is_of_them or is_main):
                 self.plan["only_these"] = True
         if self.plan["only_these"] and not has_open:
             self.plan |= {"plazas": 0, "greens": 0}
 
     def _set_heights(self) -> None:
-        """Limit the heights of all kinds of buildings."""
-        low_m = 0.0
-        high_m: float | None = None
-        for name, match in self.heights.items():
-            unit_m = _metres(match["unit"])
-            height_m = float(match["number"]) * unit_m
-            if name == "at_least":
-                low_m = height_m
-            else:
-                high_m = height_m
-            if name == "between":
-                low_m = float(match["low"]) * unit_m
-            elif name == "exactly":
-                low_m = height_m - 0.9 * unit_m  # less than a storey lower, so that their number is the same
-        if high_m is None and re.search(r"\b(?:high|tall|towers?|skyscrapers?)", self.absent):
-            high_m = LOW_TOWN_M
-        is_possible = max(low_m, LOWEST_M) <= (HIGHEST_M if high_m is None else high_m) <= HIGHEST_M
-        if not is_possible:
-            got = " ".join(match[0].strip() for match in self.heights.values())
-            expected = "a lowest height below the highest, both within 3 to 450 m"
-            raise InputError("the range of building heights is impossible", where="PROMPT", got=got, expected=expected)
-        for group in (self.plan, *self.plan["buildings"]):
-            group["heights_m"] = _limited(group["heights_m"], low_m, high_m, is_replaced="between" in self.heights)
+        """Limit the heights of all buildings, and of the kinds that have limits of their own."""
+        of_all = self.limits.get("town", {})
+        if not of_all and re.search(r"\b(?:high|tall|towers?|skyscrapers?)", self.absent):
+            for group in (self.plan, *self.plan["buildings"]):
+                group["heights_m"] = _limited(group["heights_m"], 0.0, LOW_TOWN_M, is_replaced=False)
+        for name, group in [("", self.plan), *((group["name"], group) for group in self.plan["buildings"])]:
+            limits = self.limits.get(name) or of_all
+            low_m, high_m = _range_of(limits)
+            if not max(low_m, LOWEST_M) <= (HIGHEST_M if high_m is None else high_m) <= HIGHEST_M:
+                got = " ".join(match[0].strip() for match in limits.values())
+                what, expected = "the range of heights is impossible", "a lowest below the highest, within 3 to 450 m"
+                raise InputError(what, where="PROMPT", got=got, expected=expected)
+            is_replaced = bool({"between", "exactly"} & limits.keys())
+            group["heights_m"] = _limited(group["heights_m"], low_m, high_m, is_replaced=is_replaced)
+
+    def _set_widths(self) -> None:
+        """Set the widths of streets and of the water to those of the prompt."""
+        for target, (field, low_m, high_m) in WIDTHS.items():
+            for name, match in self.limits.get(target, {}).items():
+                width_m = float(match["number"])
+                if name == "between":
+                    width_m = (float(match["low"]) + width_m) / 2
+                if name == "at_least":
+                    width_m = max(width_m, self.plan[field])
+                if name in ("at_most", "or_less"):
+                    width_m = min(width_m, self.plan[field])
+                self.plan[field] = self._within(f"width of a {target}, m", width_m, low_m, high_m)
+        self.plan["avenue_m"] = max(self.plan["avenue_m"], self.plan["street_m"])
 
     def _set_size(self) -> None:
         """Set the size of the town to that of the prompt."""
@@ -519,6 +554,24 @@ class _Reader:
         if possible != value:
             self.not_respected.append(f"{what}: {value:g} is said, {possible:g} is possible")
         return possible
+
+
+def _range_of(limits: dict[str, re.Match[str]]) -> tuple[float, float | None]:
+    """Return the lowest height of limits, and the highest, m; 0 and None where there is none."""
+    low_m: float = 0.0
+    high_m: float | None = None
+    for name, match in limits.items():
+        unit_m = _metres(match["unit"])
+        height_m = float(match["number"]) * unit_m
+        if name == "at_least":
+            low_m = height_m
+            continue
+        high_m = height_m
+        if name == "between":
+            low_m = float(match["low"]) * unit_m
+        elif name == "exactly":
+            low_m = height_m - 0.9 * unit_m  # less than a storey lower, so that their number is the same
+    return low_m, high_m
 
 
 def _limited(heights_m: Any, low_m: float, high_m: float | None, *, is_replaced: bool) -> tuple[float, float]:

@@ -37,7 +37,7 @@ CHECKS_FORMAT = FileFormat("cosfly.world_checks", "1.0", "checks of a world")
 CREDITS = "cosfly; sizes of assets by SimWorld, maitrix-org and contributors"
 MOST_CHARACTERS = 2000  # of a prompt
 PICTURE_PX = 1000  # longer side of the picture
-MOST_LABELS = 5  # objects of a name that the picture labels
+MOST_LABELS = 5  # objects or buildings of a name that the picture labels
 CARS = ("Car", "Truck")
 ROAD_COST = 20  # a metre of carriageway away from crossings costs as much as 20 m of pavement
 
@@ -99,7 +99,7 @@ def check_world(town: Town, plan: WorldPlan) -> list[WorldCheck]:
     ]
     for kind in kinds:
         if kind.count is not None:
-            checks.append(_check(f"number of {kind.name}s", town.built[kind.name], kind.count, kind.count))
+            checks.append(_check(f"number of buildings ({kind.name})", town.built[kind.name], kind.count, kind.count))
     num_planned, num_open = plan.plazas + plan.greens, len(_open_blocks(town, plan))
     checks.append(_check("plazas and green blocks", num_open, num_planned, max(num_planned, num_open)))
     return checks
@@ -193,10 +193,14 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     write_json(out / "trace.json", {"prompt": prompt, **trace})
     write_bytes(out / "plan.yaml", plan.to_yaml().encode())
     town = build(plan, cfg.name, seed)
+    if plan.kinds_of_buildings() and not town.built:
+        size = " x ".join(f"{side_m:.0f} m" for side_m in town.size_m)
+        what, fix = "the town has no room for a building", "make it larger, or its blocks or buildings smaller"
+        raise InputError(what, where="PROMPT", got=f"{size}, blocks of {plan.block_m:.0f} m", fix=fix)
     _write_world(town, out)
     checks = check_world(town, plan)
     not_respected = _not_respected(checks, town, trace)
-    unread = {"not_respected": not_respected, "words_not_used": plan.not_used}
+    unread = {"not_respected": not_respected, "words_not_used": trace["not_used"]}
     write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks, **unread})
     write_bytes(out / "map.png", _picture(town, plan))
     _write_settings(cfg.name, product, out / LOOP_FILE)
@@ -238,6 +242,7 @@ def _picture(town: Town, plan: WorldPlan) -> bytes:
         (obj.name, obj.xy)
         for obj in town.placed if obj.number < MOST_LABELS and OBJECTS[obj.name].where != "layout"
     ]  # fmt: skip
+    labels += [place for place in town.counted if town.built[place[0]] <= MOST_LABELS]
     for name, block in _open_blocks(town, plan):
         if not any(block.covers(shapely.Point(xy)) for _, xy in labels):
             labels.append((name, block.centroid.coords[0]))

@@ -24,9 +24,10 @@ from cosfly.formats.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.formats.kinds import KIND_NAMES, KINDS
 from cosfly.maps.boxlist import SLAB_M, BoxList
 from cosfly.maps.footprints import Rectangle, footprints, oriented_rectangle, polygons_of, rectangle_polygon
+from cosfly.runtime.errors import nearest
 from cosfly.runtime.seeding import rng_for
 from cosfly.simulators.assets import ASSETS
-from cosfly.worldgen.plan import VERGE_M, Buildings, Object, Range, WorldPlan, assets
+from cosfly.worldgen.plan import OBJECTS, VERGE_M, Buildings, Object, Range, WorldPlan, assets
 from cosfly.worldgen.streets import GROUND_TOP_M, LANE_M, lay_streets, network, pave
 
 CM_PER_M = 100.0
@@ -140,8 +141,10 @@ class Town:
         self.seed = seed
         self.built = Counter[str]()  # numbers of buildings by kind
         self.placed = list[Placed]()
+        self.counted = list[tuple[str, Range]]()  # kinds and places of the counted buildings
         # Names and reasons of missing objects, an entry for each.
-        self.not_placed = [(missing, "not in the object table") for missing in plan.unknown_objects()]
+        unknown = plan.unknown_objects()
+        self.not_placed = [(name, f"not in the object table{nearest(name, list(OBJECTS))}") for name in unknown]
         self.object_nodes = list[tuple[str, str | None]]()  # name and asset of each box of `placement`
         self._boxes = BoxList()  # streets and buildings
         self._objects = BoxList()
@@ -211,8 +214,9 @@ class Town:
         plan = self.plan
         rng = rng_for(self.seed, "world", "open")
         blocks = self._closed_blocks[: max(1, len(self._closed_blocks) // 2)]
-        rest = blocks[self.num_plazas :]
-        chosen = blocks[: self.num_plazas] + [rest[k] for k in rng.permutation(len(rest))]
+        num_middle = max(1, self.num_plazas)  # without a plaza, one green is in the middle
+        rest = blocks[num_middle:]
+        chosen = blocks[:num_middle] + [rest[k] for k in rng.permutation(len(rest))]
         if len(chosen) < self.num_open:  # open lots along streets
             lots = self._lots([(0.7 * plan.block_m,) * 2], rng, setback_m=0.0)
             chosen += [rectangle_polygon(lot) for lot in islice(lots, self.num_open - len(chosen))]
@@ -292,6 +296,8 @@ class Town:
         self._add_path(self._boxes, lot)
         self._taken.append(rectangle_polygon(lot))
         self.built[kind.name] += 1
+        if kind.count is not None:
+            self.counted.append((kind.name, lot.center))
 
     def _add_path(self, boxes: BoxList, place: Rectangle) -> None:
         """Add a path from a building to the nearest pavement."""
