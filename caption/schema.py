@@ -182,7 +182,7 @@ class CaptionConfig(Config):
 
     teacher: str = Field(
         "rules",
-        description="`rules` (embedded, no model), the URL of an OpenAI-compatible endpoint, `vllm:MODEL_DIR`, "
+        description="`rules` (built in, no model), the URL of an OpenAI-compatible endpoint, `vllm:MODEL_DIR`, "
         "`file:PATH` with one caption per line, or `student:PATH`, output of `distill infer`",
     )
     writing: Writing = Field(

@@ -46,12 +46,12 @@ def run(
 
     Args:
         data: Playback tree, ours or of the public layout.
-        workers: Processes of an embedded teacher without a judge; a model takes `endpoint.concurrency` requests.
+        workers: Processes of a built-in teacher without a judge; a model takes `endpoint.concurrency` requests.
         retry_failed: Ask again about the windows that the server refused, which are in `quarantine.jsonl`.
 
     Raises:
         InputError: There is no track. NothingKept: No track is long enough, or no window got a caption.
-        ConfigError: `retry_failed` with an embedded teacher.
+        ConfigError: `retry_failed` with a built-in teacher.
         TeacherError: The endpoint cannot be used, a budget is used up, or windows got no answer. Answers are kept.
     """
     if cfg.teacher_kind in EMBEDDED and retry_failed:
@@ -172,7 +172,7 @@ def _continues(stage: StageFolder, cfg: CaptionConfig, retry_failed: bool) -> bo
     return is_retried or (limit_before is not None and limit > limit_before)
 
 
-# --- embedded teachers ------------------------------------------------------------------------------------------------
+# --- built-in teachers ------------------------------------------------------------------------------------------------
 
 
 def make_worker(cfg: CaptionConfig, vocabulary: Vocabulary, stage_path: Path, seed: int) -> Work:

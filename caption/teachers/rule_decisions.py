@@ -1,4 +1,4 @@
-"""The decision of the embedded rule teacher: the manoeuvre to which the observed motion leads.
+"""The decision of the built-in rule teacher: the manoeuvre to which the observed motion leads.
 
 The motion of drone and target is extrapolated and compared with what each manoeuvre takes. How much of the extrapolated
 motion to expect is fitted on training towns, for tracks with and without perturbation.

@@ -1,4 +1,4 @@
-"""The embedded rule teacher: deterministic, looks only at the facts measured on the observed frames.
+"""The built-in rule teacher: deterministic, looks only at the facts measured on the observed frames.
 
 It chooses a decision (rule_decisions.py) and writes English and Chinese templates, whose slots are filled as any other
 teacher's are. `rule_sentences.yaml` has the sentences of each of the CONDITIONS. It is no model and sees no picture.

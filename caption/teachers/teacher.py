@@ -1,6 +1,6 @@
 """Teachers, which answer a `Question`.
 
-`RuleTeacher` is embedded and deterministic, `GivenTeacher` reads a file. `AskingTeacher` asks a language model through
+`RuleTeacher` is built in and deterministic, `GivenTeacher` reads a file. `AskingTeacher` asks a language model through
 an engine (cosfly/llm); every answer is journaled before it is used. `ask` answers in English, `mirror` gives the
 Chinese of an English answer; its complaint says what was wrong with the last one.
 """

@@ -1,4 +1,4 @@
-"""The embedded planner: reads an English prompt by tables of words, without a model.
+"""The built-in planner: reads an English prompt by tables of words, without a model.
 
 The reader takes each phrase that it understands out of the text. So no later phase reads it again, and what remains are
 the words that were not used. The order of the phases is the grammar; `_Reader.read` gives the reason for each.
