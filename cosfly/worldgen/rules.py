@@ -46,10 +46,9 @@ LINEAR_DEPTH = 2.4  # depth of a linear town of a given length, in blocks
 # Patterns of the text, which is in lower case with numbers in digits, each with an example.
 _NUMBER = r"(\d+(?:\.\d+)?)"
 _LENGTH = r"(km|kilomet(?:er|re)s?|m|metres?|meters?)\b"
-_HEIGHT = (  # "12 m", "3-storey", "8 m wide", but not the "12 m" of "12 m long"
+_HEIGHT = (  # "12 m", "3-storey", but not the "12 m" of "12 m deep"
     rf"(?P<number>{_NUMBER})[ -]?(?P<unit>m|metres?|meters?|floors?|storeys?|stor(?:y|ies)|levels?)\b"
-    r"(?! (?:long|x|by|apart|away|deep|thick|from|in diameter)\b)"
-    r"(?: high| tall| in height|(?P<wide>[ -]wide| in width))?"
+    r"(?! (?:x|by|apart|away|deep|thick|from|in diameter)\b)(?: high| tall| in height)?"
 )
 _HEIGHTS = {
     # "no building is higher than 20 m", "up to 3 floors"
@@ -68,6 +67,7 @@ _SIZES = {
     # "2.5 sq km"
     "area": rf"{_NUMBER} ?(km2|km²|square kilomet(?:er|re)s?|sq\.? ?km|hectares?|ha|m2|m²|square met(?:er|re)s)(?!\w)",
     "length": rf"{_NUMBER} ?{_LENGTH} long\b",  # "800 m long"
+    "width": rf"(?P<number>\d+(?:\.\d+)?) ?{_LENGTH}(?:[ -]wide| in width)\b",  # "8 m wide", also of streets and water
 }
 _CARS = r"\b\d+ (?:[a-z-]+ )?cars(?: parked)?\b"  # a number, which is not used: "20 parked cars"
 _ABSENT = r"\b(?:no|without(?: any)?)\s+((?:(?! (?:but|and|with) )[^.,;:()])+)"  # "without any towers"
@@ -117,11 +117,16 @@ _TOKEN = re.compile(
 )
 
 
+def _holds(text: str, word: str) -> bool:
+    return re.search(rf"(?<![\w-]){re.escape(word)}s?(?![\w-])", text) is not None
+
+
 class _Phrase:
     """The adjectives and nouns between two prepositions or punctuation marks."""
 
     def __init__(self, end: str) -> None:
         self.ends = [end]  # what is before it
+        self.text = ""
         self.adjectives = list[tuple[int, str]]()  # with their places in the text
         self.measures = list[int]()  # their numbers
         self.nouns = list[str]()
@@ -138,6 +143,7 @@ def _phrases(text: str) -> list[_Phrase]:
     phrases = [_Phrase(".")]
     for match in _TOKEN.finditer(text):
         phrase = phrases[-1]
+        phrase.text += " " + (match[0] if not match["end"] else "")
         if match["measure"]:
             phrase.measures.append(int(match["measure"]))
         elif match["end"] and not (phrase.adjectives or phrase.nouns or phrase.words or phrase.measures):
@@ -172,7 +178,7 @@ def _noun_of_measure(phrases: list[_Phrase], number: int, name: str, match: re.M
         return match["what"] if match["what"] in NOUNS else ""  # "no house is higher than 8 m"
     if phrase.head:
         return phrase.head
-    is_of_town = "." in phrase.ends or (name in _SIZES and "of" not in phrase.ends)
+    is_of_town = "." in phrase.ends or (name in _SIZES and "of" not in phrase.ends and "each" not in phrase.words)
     return "" if is_of_town else _noun_before(phrases, number) or _nearby_noun(phrases, number)
 
 
@@ -206,14 +212,14 @@ def _normalized(prompt: str) -> str:
         ("lakeside", r"\b(?:shores?|banks?|edge) of (?:a|the) (?:\w+ )?lake\b|\blake ?(?:shore|front)\b"),
         ("industrial", r"\bindustrial (?:park|estate)\b"), (r"\1-park", r"\b(business|logistics) park\b"),
         (r"\1public park", r"^((?:an? |the )?(?:[\w-]+ ){0,2})(?<!car )park\b"),  # not the one of "a city with a park"
-        ("1-stor", r"\bsingle[- ]stor"), ("hotel-buildings", r"(?<!\d )\bhotels\b"),
+        ("1-stor", r"\bsingle[- ]stor"), ("hotel-buildings", r"\bhotels\b"),
         (r"apartment block\1", r"\bblock(s?) of flats\b"), ("apartments", r"\bflats\b"),
         (r"\1s of at most", r"\bthe (?:tallest|highest) (house|building)s? (?:is|are|has)\b"),
         # "no building except the church is higher than 12 m"
         (r"\1 is", r"\b((?:no|none|nothing)(?: \w+)?),? (?:but|except|other than|apart from)(?: \w+){1,4},? is\b"),
     ):  # fmt: skip
         text = re.sub(pattern, plain, text)
-    text = re.sub(r"\b([2-9]0)[- ]([1-9])\b", lambda match: str(int(match[1]) + int(match[2])), text)  # "20-5": 25
+    text = re.sub(r"\b([2-9]0)-([1-9])\b", lambda match: str(int(match[1]) + int(match[2])), text)  # "20-5": 25
     text = re.sub(r"\b(\d+) ?[-–] ?(\d+)\b", r"\1 to \2", text)  # "15-20 m"
     return f" {text} "
 
@@ -294,7 +300,7 @@ class _Reader:
     # --- phrases of the text ---
 
     def _has(self, words: str) -> bool:
-        return any(re.search(rf"(?<![\w-]){re.escape(word)}s?(?![\w-])", self.text) for word in _words(words))
+        return any(_holds(self.text, word) for word in _words(words))
 
     def _take(self, pattern: str, keep: str = ",") -> re.Match[str] | None:
         """Return the first match of a pattern, and put `keep` in its place."""
@@ -324,7 +330,7 @@ class _Reader:
         if match is None:
             return None
         meaning = "" if name in match[3] else f" ({name})"
-        self.used.append(f"{match[1] or ''} {match[3]}{meaning}".strip())
+        self.used.append(f"{match[1] or ''} {match[3]}{meaning}".strip().replace("hotel-building", "hotel"))
         return int(match[1] or 0) or (1 if match[3] == word else plural_count)
 
     def _take_phrases(self) -> None:
@@ -343,9 +349,8 @@ class _Reader:
         for word in _words(WORDS["lacking"]):  # before buildings: a control tower is none either
             if match := self._take(rf"(?:\b\d+ )?\b{word}s?\b"):
                 self.not_used.append(match[0].strip())
-        # Before buildings: a shanty is one, but a shanty town is a settlement. The words of both stay in the text until
-        # all else is read, because other tables have them too: a harbour has water.
-        self.pattern = next((name for name, words in WORDS["patterns"].items() if self._has(words)), None)
+        # The words of settlements and patterns stay in the text until all else is read, because other tables have them
+        # too: a harbour has water.
         self.buildings = self._take_buildings()
 
     def _take_objects(self) -> dict[str, int]:
@@ -372,6 +377,11 @@ class _Reader:
     def _attach_words(self) -> None:
         """Find the named settlement, and take the measures and adjectives for what their nouns stand for."""
         phrases = _phrases(self.text)
+        # "Winding streets" name a pattern, a round pond does not.
+        of_streets = ",".join(phrase.text for phrase in phrases if NOUNS.get(phrase.head, "town") in (*WIDTHS, "town"))
+        for name, patterns in WORDS["patterns"].items():
+            is_named = any(_holds(self.text if " " in word else of_streets, word) for word in _words(patterns))
+            self.pattern = self.pattern or (name if is_named else None)
         for number, phrase in enumerate(phrases):
             if not self.named and phrase.head in SETTLEMENT_NOUNS:
                 self.named = next((name for name, words in SETTLEMENTS.items() if words & {*phrase.nouns}), None)
@@ -396,22 +406,20 @@ class _Reader:
     def _attach_measure(self, name: str, match: re.Match[str], noun: str) -> None:
         """Take a measure as the size of the town, as a limit of heights, or as the width of streets or water."""
         target = NOUNS.get(noun, "other") if noun else "town"
-        if target == "building":
-            target = "town"
         is_width = target in WIDTHS
-        if name in _SIZES:
+        if name in _SIZES and not (name == "width" and is_width):
             is_used = target == "town" or (name == "length" and is_width)
             chosen = self.sizes
         else:
-            is_metres = match["unit"].startswith("m")
-            is_used = target != "other" and (is_metres if is_width else not match["wide"])
+            target = "town" if target == "building" else target
+            is_used = target != "other" and (name == "width" or not is_width or match["unit"].startswith("m"))
             is_used = is_used and not _OF_SOME.search(match.string[: match.start()])
             chosen = self.limits.setdefault(target, {}) if is_used else {}
             if name != "at_least" and chosen.keys() - {"at_least"}:  # only the first limits the highest building
                 is_used = False
         if is_used and name not in chosen:
             chosen[name] = match
-            self.used.append(f"{match[0].strip()} ({'size' if name in _SIZES else noun or 'all buildings'})")
+            self.used.append(f"{match[0].strip()} ({'size' if chosen is self.sizes else noun or 'all buildings'})")
         else:
             self.not_used.append(match[0].strip())
 
@@ -436,7 +444,8 @@ class _Reader:
         has_open = bool(named)
         if has_open:  # what the settlement has without being asked
             self.plan |= dict.fromkeys({"plazas", "greens"} - named, 0)
-        self._take_words(",".join(WORDS["water"]))
+        self._take_words(",".join(WORDS["rivers"].split(",")))
+        self._take_words(",".join(WORDS["water"]), "shore")
         num_bridges = self.objects.get("bridge", 0) + self.objects.get("footbridge", 0)
         if re.search(r"\bbridges?\b", self.absent):
             self.plan["bridges"] = 0
@@ -475,6 +484,8 @@ class _Reader:
             for name, factor in WORDS["groups"][group][choice].items():
                 if name in FIELDS[target] and name in fields:
                     fields[name] = _scaled(fields[name], factor)
+        if target != "town" and "footprint_m" in fields:
+            fields["footprint_m"] = tuple(max(side_m, LEAST_FOOTPRINT_M) for side_m in fields["footprint_m"])
 
     def _set_buildings(self, has_open: bool) -> None:
         """Set the kinds of buildings, and whether there are no others."""
@@ -489,7 +500,6 @@ class _Reader:
                 self._apply_choices("town", group)
             if name != "building":  # whose adjectives are those of all buildings
                 self._apply_choices(name, group)
-                group["footprint_m"] = tuple(max(side_m, LEAST_FOOTPRINT_M) for side_m in group["footprint_m"])
             if count is None and "gap_m" in row:
                 self.plan["gap_m"] = row["gap_m"]
             self.plan["buildings"].append(group)

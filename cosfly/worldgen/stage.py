@@ -20,7 +20,7 @@ from cosfly.maps.footprints import footprints
 from cosfly.maps.simworld import PLACEHOLDER_CM
 from cosfly.runtime.config import Config, read_yaml, shipped
 from cosfly.runtime.config import build as build_config
-from cosfly.runtime.errors import InputError, TeacherError, counts_text
+from cosfly.runtime.errors import InputError, TeacherError, counts_text, nearest
 from cosfly.runtime.io import sha256_bytes, write_bytes
 from cosfly.runtime.json_io import FileFormat, validated, write_json
 from cosfly.runtime.model_json import find_object
@@ -37,7 +37,7 @@ CHECKS_FORMAT = FileFormat("cosfly.world_checks", "1.0", "checks of a world")
 CREDITS = "cosfly; sizes of assets by SimWorld, maitrix-org and contributors"
 MOST_CHARACTERS = 2000  # of a prompt
 PICTURE_PX = 1000  # longer side of the picture
-MOST_LABELS = 5  # objects or buildings of a name that the picture labels
+MOST_LABELS = 12  # objects or buildings of a name that the picture labels
 CARS = ("Car", "Truck")
 ROAD_COST = 20  # a metre of carriageway away from crossings costs as much as 20 m of pavement
 
@@ -118,7 +118,10 @@ def _not_respected(checks: list[WorldCheck], town: Town, trace: dict[str, Any]) 
 
 def _problems(not_respected: list[str], town: Town, trace: dict[str, Any]) -> str:
     """Return one line that names what of a prompt the world does not respect; empty where it respects all."""
-    missing = Counter(f"{name} ({reason})" for name, reason in town.not_placed)
+    missing = Counter(
+        f"{name} ({reason}{'' if name in OBJECTS else nearest(name, list(OBJECTS))})"
+        for name, reason in town.not_placed
+    )
     lists = {
         "not respected": not_respected,
         "not placed": [f"{count} x {name}" if count > 1 else name for name, count in missing.items()],
@@ -192,10 +195,15 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
         plan, trace = plan_by_rules(prompt, seed)
     write_json(out / "trace.json", {"prompt": prompt, **trace})
     write_bytes(out / "plan.yaml", plan.to_yaml().encode())
+    if "used" in trace:
+        log.info("words used: %s", ", ".join(trace["used"]))
     town = build(plan, cfg.name, seed)
     if plan.kinds_of_buildings() and not town.built:
         size = " x ".join(f"{side_m:.0f} m" for side_m in town.size_m)
-        what, fix = "the town has no room for a building", "make it larger, or its blocks or buildings smaller"
+        what = "the town has no room for a building"
+        fix = (
+            f"make the town larger, or its blocks and streets smaller, in the text or in a copy of {out / 'plan.yaml'}"
+        )
         raise InputError(what, where="PROMPT", got=f"{size}, blocks of {plan.block_m:.0f} m", fix=fix)
     _write_world(town, out)
     checks = check_world(town, plan)
@@ -204,8 +212,6 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks, **unread})
     write_bytes(out / "map.png", _picture(town, plan))
     _write_settings(cfg.name, product, out / LOOP_FILE)
-    if "used" in trace:
-        log.info("words used: %s", ", ".join(trace["used"]))
     if problems := _problems(not_respected, town, trace):
         log.warning("%s", problems)
     by_seed = "" if trace.get("pattern_is_named", True) else " (chosen by the seed)"

@@ -24,10 +24,9 @@ from cosfly.formats.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.formats.kinds import KIND_NAMES, KINDS
 from cosfly.maps.boxlist import SLAB_M, BoxList
 from cosfly.maps.footprints import Rectangle, footprints, oriented_rectangle, polygons_of, rectangle_polygon
-from cosfly.runtime.errors import nearest
 from cosfly.runtime.seeding import rng_for
 from cosfly.simulators.assets import ASSETS
-from cosfly.worldgen.plan import OBJECTS, VERGE_M, Buildings, Object, Range, WorldPlan, assets
+from cosfly.worldgen.plan import VERGE_M, Buildings, Object, Range, WorldPlan, assets
 from cosfly.worldgen.streets import GROUND_TOP_M, LANE_M, lay_streets, network, pave
 
 CM_PER_M = 100.0
@@ -143,8 +142,7 @@ class Town:
         self.placed = list[Placed]()
         self.counted = list[tuple[str, Range]]()  # kinds and places of the counted buildings
         # Names and reasons of missing objects, an entry for each.
-        unknown = plan.unknown_objects()
-        self.not_placed = [(name, f"not in the object table{nearest(name, list(OBJECTS))}") for name in unknown]
+        self.not_placed = [(missing, "not in the object table") for missing in plan.unknown_objects()]
         self.object_nodes = list[tuple[str, str | None]]()  # name and asset of each box of `placement`
         self._boxes = BoxList()  # streets and buildings
         self._objects = BoxList()
