@@ -195,8 +195,7 @@ class CaptionConfig(Config):
         "paper: velocity, altitude, yaw, target speed, visibility, world poses",
     )
     prompts: Path | None = Field(
-        None,
-        description="folder with your own prompts; `cosfly caption prompts --export DIR` writes one to begin with",
+        None, description="folder with your own prompts; `cosfly caption prompts --export DIR` writes one to begin with"
     )
     flights: TrackChoice = Field(TrackChoice(), description="tracks to caption")
     window: WindowConfig = Field(WindowConfig(), description="windows")

@@ -117,14 +117,14 @@ _SERIES = (
 )  # fmt: skip
 _SPANNED = ("ahead", "distance", "altitude", "yaw", "offset_x")  # shown with change and trend
 _NOW = (
-    "mean:speed", "forward_speed", "sideways_speed", "climb_rate", "mean:target_speed", "target_forward_speed",
-    "target_sideways_speed", "target_heading", "change:target_heading", "rate:distance", "growth:box_height",
-    "height_over_target", "depression", "travelled", "target_travelled", "others_in_view", "other_distance",
-    "alike_differences",
+    "yaw_rate", "mean:speed", "forward_speed", "sideways_speed", "climb_rate", "mean:target_speed",
+    "target_forward_speed", "target_sideways_speed", "target_heading", "change:target_heading", "rate:distance",
+    "growth:box_height", "height_over_target", "depression", "travelled", "target_travelled", "others_in_view",
+    "other_distance", "alike_differences",
 )  # fmt: skip
 _WORDS = (
-    "target_motion", "drone_motion", "walking", "comparison:speed", "framing", "side:yaw", "side:target_heading",
-    "side:bearing", "trend:bearing", "side:offset_x", "side:offset_y", "side:sideways_speed",
+    "target_motion", "drone_motion", "walking", "comparison:speed", "framing", "side:yaw", "side:yaw_rate",
+    "side:target_heading", "side:bearing", "trend:bearing", "side:offset_x", "side:offset_y", "side:sideways_speed",
     "side:target_sideways_speed", "box@t0", "box",
 )  # fmt: skip
 
@@ -161,6 +161,8 @@ _NEITHER = ("straight", "centred")  # words of a side that say neither side
 # A side of these is a reason to turn to it; when the drone itself moves to the left, it may have to turn to the right.
 # With a first frame it may be a side of an earlier time.
 _TURN_REASONS = [(name, "side", None) for name in ("yaw", "offset_x", "bearing", "target_sideways_speed")]
+STEADY_DPS = 0.5  # slower turns are none
+_LINE_OF_SIGHT, _GOES_ON = re.compile("line of sight|视线|连线"), re.compile("go on|continu|keep turning|继续向")
 _VOWEL = re.compile(r"[aeio]|8|1[18]\b")  # what begins with a vowel when it is spoken: eight, eleven, eighteen
 
 
@@ -178,8 +180,14 @@ class Filler:
         return filled[0].upper() + filled[1:] if sentence.pattern.startswith("%s") else filled
 
     def _check_reason(self, sentence: Sentence) -> None:
-        """Raise InvalidSlot if a sentence gives a fact to one side as the reason for a turn to the other."""
-        other = "left" if "right" in self.decision else "right"
+        """Raise InvalidSlot if a sentence gives a fact or a turn to one side as the reason for a turn to the other."""
+        other, sign = ("left", -1) if "right" in self.decision else ("right", 1)
+        turn_dps = max(
+            sign * self.facts.yaw_deg[-1], sign * (self.facts.yaw_rate_dps[-1] or 0.0)
+        )  # surely to the other
+        for words, moved in ((_LINE_OF_SIGHT, sign * self.facts.sight_rate_dps), (_GOES_ON, turn_dps)):
+            if moved < -STEADY_DPS and (match := words.search(sentence.pattern)):
+                raise InvalidSlot(f"{match[0]!r}: the turn is to the {other} here, no reason for {self.decision}")
         for slot in sentence.slots:
             if slot.reference and slot.reference[:3] in _TURN_REASONS:
                 fact = look_up(slot.reference, self.facts)
@@ -208,7 +216,7 @@ class Filler:
             fix = f"it is {value} here, neither side: leave this slot out, or write `is {{{slot.name}}}`"
             raise InvalidSlot(f"{{{slot.name}}}: {fix}")
         sign = 0 if isinstance(value, str) else (value > 0) - (value < 0)
-        if (slot.not_negative and sign < 0) or (slot.not_positive and sign > 0):
+        if (slot.is_amount and sign < 0) or (slot.direction and sign != slot.direction):
             fix = "name its direction by a slot for a side or a trend"
             raise InvalidSlot(f"{{{slot.name}}} is {value} here, which does not fit the words before it: {fix}")
         if not isinstance(value, str):

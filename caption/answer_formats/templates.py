@@ -34,12 +34,11 @@ _BRACES = re.compile(r"\{([^{}]*)\}")
 _ARTICLE = re.compile(r"\b([Aa])n?\s+$")
 # Words before a change, a rate or a climb: of an amount, which is not negative, or of a direction, which is its sign.
 _AMOUNT = {"en": r"\bby\s+$", "zh": r"了\s*$"}
-_RISES = {"en": r"(?:increas|grow|ris[ei]|rose|climb|ascend|widen|reced)", "zh": "(?:增|升|变大|扩大|远离)"}
-_FALLS = {
-    "en": r"(?:decreas|shr[iu]nk|(?:f[ae]ll|drop)(?!\w*\s+b(?:ack|ehind))|descend|sink|narrow|approach)",
-    "zh": "(?:减|降|缩|变小|靠近|接近)",
+_DIRECTIONS: dict[Language, str] = {
+    "en": r"(?:(?P<rises>increas|grow|ris[ei]|rose|climb|ascend|widen|reced)|(?P<falls>decreas|shr[iu]nk|descend|sink"
+    r"|(?:f[ae]ll|drop)(?!\w*\s+b(?:ack|ehind))|narrow|approach))\w*(?:\s+\w+){0,3}\s+$",
+    "zh": "(?:(?P<rises>增|升|变大|扩大|远离)|(?P<falls>减|降|缩|变小|靠近|接近))[^，。；,;]{0,6}$",
 }
-_NEAR = {"en": r"\w*(?:\s+\w+){0,3}\s+$", "zh": r"[^，。；,;]{0,6}$"}
 _CHANGES = ("change", "rate", "growth")
 _VERBS = ("target_motion", "drone_motion", "walking")
 _ALIASES = {  # what prompts call a slot -> its reference; "compared" is the comparison seen from the target
@@ -64,8 +63,8 @@ class Slot:
     # Another slot of the sentence has the same direction: a number is written without its sign, and a side is that of
     # the number, however small.
     is_paired: bool = False
-    not_negative: bool = False  # because of the words before it
-    not_positive: bool = False
+    is_amount: bool = False  # because of the words before it, which ask for a number that is not negative
+    direction: int = 0  # 1 or -1 if the words before it ask for this sign
     article: str = ""  # "a" before the slot, which becomes "an" if the value needs it; "" if there is none
 
     @property
@@ -200,11 +199,10 @@ def _with_bounds(slot: Slot, before: str, language: Language) -> Slot:
     if reference is None or slot.is_paired or not (slot.name == "climb_rate" or reference.aspect in _CHANGES):
         return slot
     is_amount = re.search(_AMOUNT[language], before, re.IGNORECASE) is not None
-    rises, falls = (
-        not QUANTITIES[reference.quantity].sides and bool(re.search(words[language] + _NEAR[language], before, re.I))
-        for words in (_RISES, _FALLS)
-    )
-    return replace(slot, not_negative=is_amount or (rises and not falls), not_positive=falls and not rises)
+    match = None if QUANTITIES[reference.quantity].sides else re.search(_DIRECTIONS[language], before, re.IGNORECASE)
+    if match is None or is_negated(before.lower(), match.start(), language):
+        return replace(slot, is_amount=is_amount)
+    return replace(slot, is_amount=is_amount, direction=1 if match["rises"] else -1)
 
 
 # --- words around a slot ----------------------------------------------------------------------------------------------

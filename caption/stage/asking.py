@@ -104,9 +104,9 @@ class Asking:
                         self.teacher, self.judge = teacher, judge
                         self.progress = RunProgress(advance, total, budget)
                         if self.cfg.most_in_flight == 1 and (num_answers := answers.totals["answers"]):
-                            answer_s = answers.latency_s / num_answers
-                            what = "caption: answers took %.1f s each; two for each of %d windows take about %s"
-                            log.info(what, answer_s, total, duration(answer_s * ANSWERS_PER_WINDOW * total))
+                            left_s = answers.latency_s / num_answers * max(0, ANSWERS_PER_WINDOW * total - num_answers)
+                            what = "caption: %d answers are stored; two for each of %d windows take about %s more"
+                            log.info(what, num_answers, total, duration(left_s))
                         await self._ask_all(tracks, guesses)
                 if self.progress.windows.input:
                     log.info("caption: %s", self.progress.figures())
@@ -129,6 +129,7 @@ class Asking:
         heartbeat = asyncio.create_task(self._show_progress())
         try:
             async with asyncio.TaskGroup() as tasks:  # an error in one task cancels the others
+                self.tasks = tasks
                 for track, guess in zip(tracks, guesses, strict=True):
                     part = track.part(self.stage.path)
                     if part.exists() and track.name in self.retried_tracks:  # it is unfinished again
@@ -267,6 +268,7 @@ class Asking:
         if caption.status == "accepted":
             self.has_accepted = True
         limit = self.cfg.stop_after_dropped if self.cfg.teacher_kind in ("endpoint", "vllm") else 0
+        self.progress.ends_after = 0 if self.has_accepted else limit
         if self.has_accepted or not limit or not caption.attempts:
             return
         self.dropped[str(caption.drop_reason)] += 1
@@ -276,7 +278,10 @@ class Asking:
             see = f"to see why, open {self.stage.path / 'report.html'}; use a larger model"
             fix = f"{see}, or to continue anyway, pass --set caption.stop_after_dropped=0"
             got = explain_drops(self.dropped, self.rejected)
-            raise TeacherError(what, where=self.cfg.teacher, got=got, fix=fix)
+            self.tasks.create_task(self._end(TeacherError(what, where=self.cfg.teacher, got=got, fix=fix)))
+
+    async def _end(self, error: TeacherError) -> None:
+        raise error  # outside the task of a window, whose caption is kept
 
 
 def read_quarantine(stage_path: Path) -> dict[str, Failed]:
@@ -297,6 +302,7 @@ class RunProgress:
         self.budget = budget
         self.windows = Tally()  # of this run
         self.num_repaired = 0
+        self.ends_after = 0  # dropped windows, if none is accepted
         self._num_answered = self._num_used = 0  # windows of this run with a caption, and their answers, old and new
         self._start_s = self._answered_s = time.monotonic()
         self._num_answers = 0
@@ -344,8 +350,9 @@ class RunProgress:
         figures = [
             f"accepted {windows.kept:,} (repaired {self.num_repaired:,})",
             f"dropped {windows.dropped.total():,}" + (f" ({reasons})" if reasons else ""),
+            *([f"ends after {self.ends_after:,} dropped windows"] if self.ends_after else []),
             f"no answer {windows.failed.total():,}",
-            f"answers {answers['answers']:,} in {duration(elapsed_s)}{waiting}",
+            f"new answers {answers['answers']:,} in {duration(elapsed_s)}{waiting}",
             f"tokens {answers['prompt_tokens']:,} read {answers['completion_tokens']:,} written",
         ]
         if answers["cut"]:
@@ -356,5 +363,5 @@ class RunProgress:
             per_window = self._num_used / self._num_answered if self._num_used else ANSWERS_PER_WINDOW
             window_s = max(self._answered_s - self._start_s, 1e-9) / answers["answers"] * per_window
             figures.append(f"{window_s:.0f} s per window" if window_s > 1.0 else f"{1 / window_s:.1f} windows/s")
-            figures.append(f"about {duration(self.num_left * window_s)} left")
+            figures += [f"about {duration(self.num_left * window_s)} left"] if self.num_left else []
         return ", ".join(figures)

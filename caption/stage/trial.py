@@ -39,9 +39,7 @@ class _LoggedAnswers(KeptAnswers):
     async def ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:
         number, (kind, ask, *correction) = len(self.exchanges[sample_id]) + 1, purpose.split("/")
         hint = "a hint" if kind.startswith("hint_") else f"the label {kind}"
-        words = KINDS.get(kind, f"regeneration with {hint}") + (
-            "" if ask == "0" else f", ask {int(ask) + 1} with another seed"
-        )
+        words = KINDS.get(kind, f"regeneration with {hint}") + ("" if ask == "0" else f", ask {int(ask) + 1}")
         if correction:
             words += ", again: " + for_terminal(request.messages[-1]["content"][-1]["text"], MOST_LOGGED)
         log.info("%s: request %d, %s", sample_id, number, words)
@@ -92,20 +90,13 @@ def show_windows(cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *,
         raise TeacherError(what, where=cfg.teacher, got=got)
     for (sample_id, of_window), outcome in zip(exchanges.items(), outcomes, strict=True):
         yield f"=== {sample_id} ==="
-        previous = None
         shown: dict[str, int] = {}
         for number, (request, reply) in enumerate(of_window, 1):
-            if request.messages == previous:
-                yield f"--- request {number}, the same with another seed ---"
-            else:
-                yield from _question_lines(number, request, shown)
+            yield from _question_lines(number, request, shown)
             yield from _answer_lines(number, reply)
-            previous = request.messages
         yield "--- outcome ---"
         if isinstance(outcome, Caption):
             yield from _outcome_lines(outcome)
-            if outcome.drop_reason == "structure" and not cfg.endpoint.json_schema:
-                yield "fix: remove caption.endpoint.json_schema=false, so that the server enforces the fields"
         else:
             yield f"no answer: {for_terminal(str(outcome))}"
     num_accepted = sum(isinstance(outcome, Caption) and outcome.status == "accepted" for outcome in outcomes)

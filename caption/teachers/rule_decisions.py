@@ -148,22 +148,8 @@ def _expect(f: Facts, g: Gains) -> dict[str, float]:
 
 def _expected_turn_deg(f: Facts, g: Gains) -> float:
     last_dps = (f.yaw_deg[-1] - f.yaw_deg[-2]) / f.step_s
-    turn_dps = g.last_turn * last_dps + g.turn * (f.yaw_rate_dps[-1] or 0.0) + g.sight * sight_rate_dps(f)
+    turn_dps = g.last_turn * last_dps + g.turn * (f.yaw_rate_dps[-1] or 0.0) + g.sight * f.sight_rate_dps
     return turn_dps * HORIZON_S + g.bearing * (f.bearing_deg[-1] or 0.0)
-
-
-def sight_rate_dps(f: Facts) -> float:
-    """Return how fast the line of sight to the target turns to the left; 0 where it is not known."""
-    pairs = zip(f.yaw_deg, f.bearing_deg, strict=True)
-    sight = [(i, yaw + bearing) for i, (yaw, bearing) in enumerate(pairs) if bearing is not None]
-    return _slope(sight) / f.step_s if len(sight) > 2 else 0.0
-
-
-def _slope(points: Sequence[tuple[float, float]]) -> float:
-    """Return the slope of the straight line that fits points best."""
-    middle = sum([x for x, _ in points]) / len(points)
-    norm = sum([(x - middle) ** 2 for x, _ in points])
-    return sum([(x - middle) * y for x, y in points]) / norm
 
 
 def _closing_m(f: Facts, ahead_m: float, left_m: float) -> float:

@@ -12,7 +12,7 @@ from functools import cache
 from itertools import islice, pairwise
 from pathlib import Path
 
-from caption.teachers.rule_decisions import LEAST_TURN_DEG, decide, expected_sizes, is_shaken, ranked, sight_rate_dps
+from caption.teachers.rule_decisions import LEAST_TURN_DEG, decide, expected_sizes, is_shaken, ranked
 from caption.verification.facts import Facts, Series
 from caption.verification.references import Fact, look_up, parse_reference
 from cosfly.formats.segments import MISSION_KINDS
@@ -214,7 +214,7 @@ def sight_swings(f: Facts, side: int) -> bool:
 def sight_turns(f: Facts, side: int) -> bool:
     """Return whether the line of sight turns to a side on which the target is, or nearly."""
     is_across = side * now(f.bearing_deg) < -ACROSS_SIGHT_DEG
-    return f.is_visible_now and not is_across and side * sight_rate_dps(f) >= TURNING_DPS
+    return f.is_visible_now and not is_across and side * f.sight_rate_dps >= TURNING_DPS
 
 
 def drifts(f: Facts, side: int) -> bool:

@@ -91,6 +91,17 @@ class Facts:
         return [None if place is None else place[axis] for place in self.place_m]
 
     @property
+    def sight_rate_dps(self) -> float:
+        """How fast the line of sight to the target turns to the left, by the line that fits best; 0 if not known."""
+        pairs = zip(self.yaw_deg, self.bearing_deg, strict=True)
+        points = [(i, yaw + bearing) for i, (yaw, bearing) in enumerate(pairs) if bearing is not None]
+        if len(points) <= 2:
+            return 0.0
+        middle = sum([x for x, _ in points]) / len(points)
+        slope = sum([(x - middle) * y for x, y in points]) / sum([(x - middle) ** 2 for x, _ in points])
+        return slope / self.step_s
+
+    @property
     def is_visible_now(self) -> bool:
         """Return whether nothing hides the target. Labels depend on this."""
         return self.visibility[-1] in ("visible", "partly_occluded", "illegible")

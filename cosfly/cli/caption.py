@@ -64,10 +64,7 @@ def caption(
 
 
 @command("cosfly caption doctor http://localhost:8000", "caption", model=MODEL)
-def doctor(
-    job: Job,
-    url: Annotated[str, Argument(help="URL of an OpenAI-compatible server.")],
-) -> None:
+def doctor(job: Job, url: Annotated[str, Argument(help="URL of an OpenAI-compatible server.")]) -> None:
     """Test what a server can do: text, images, schema, thinking, context, time. Exit with 1 if it cannot caption."""
     _examine_endpoint(url, job.cfg.caption)
     typer.echo("Pass --no-check to cosfly caption with these settings: it would repeat the tests.")

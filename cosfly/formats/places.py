@@ -26,8 +26,7 @@ class TrackChoice(Config):
     """Selects tracks of a tree."""
 
     match: tuple[str, ...] = Field(
-        (),
-        description="patterns of track folders, such as Town01/trajectory_17*/ORI or Town0[12]; empty: all",
+        (), description="patterns of track folders, such as Town01/trajectory_17*/ORI or Town0[12]; empty: all"
     )
     tracks: tuple[TrackName, ...] = Field(TRACKS, min_length=1, description="clean, perturbed, or both")
 

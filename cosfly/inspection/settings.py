@@ -44,8 +44,7 @@ class InspectConfig(Config):
     jerk_rms_max_mps3: float = Field(JERK_RMS_MAX_MPS3, gt=0, description="largest accepted RMS jerk of a plan, m/s^3")
     smoothness_min: Share = Field(0.5, description="smallest smoothness score S that needs no review; 0: no limit")
     five_ray_mean_min: Share = Field(
-        FIVE_RAY_MEAN_MIN,
-        description="smallest accepted mean five-ray visibility of the poses; 0: no limit",
+        FIVE_RAY_MEAN_MIN, description="smallest accepted mean five-ray visibility of the poses; 0: no limit"
     )
     clearance_min_m: float = Field(
         RELAXED_SAFETY_M,

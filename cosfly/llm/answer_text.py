@@ -73,10 +73,7 @@ _OTHER_LETTER = re.compile(r"[^\W\d_a-zA-Z\u00c0-\u024f\u4e00-\u9fff]")
 
 
 def parse_answer(
-    text: str,
-    language: Language = "en",
-    more: Collection[str] = (),
-    finish_reason: str | None = None,
+    text: str, language: Language = "en", more: Collection[str] = (), finish_reason: str | None = None
 ) -> Parsed:
     """Check the structure of a raw answer (phase 3 of sec:appendix_e).
 

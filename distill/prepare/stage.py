@@ -83,8 +83,7 @@ class SplitConfig(Config):
     """What splits must not share, and how large they are."""
 
     split_by: Literal["walk", "town"] = Field(
-        "walk",
-        description="what two splits must not share: a pedestrian trajectory (walk), or a town",
+        "walk", description="what two splits must not share: a pedestrian trajectory (walk), or a town"
     )
     val_fraction: float = Field(
         0.1, ge=0, lt=1, description="share of pedestrian trajectories (or towns) for validation; 0: none"
@@ -121,8 +120,7 @@ class PrepareConfig(SplitConfig):
         "first", description="place of the decision among the fields of an answer; a student answers in this order"
     )
     modalities: Distinct[tuple[View, ...]] = Field(
-        ("rgb",),
-        description="pictures of each frame, in this order; middle: the middle third of rgb; empty: only text",
+        ("rgb",), description="pictures of each frame, in this order; middle: the middle third of rgb; empty: only text"
     )
     text_state: bool = Field(True, description="the prompt contains the measured flight data; false: only pictures")
     verdicts: tuple[Verdict, ...] = Field(

@@ -57,8 +57,7 @@ class TrainConfig(Config):
         -1, ge=-1, description="number of processes that read pictures; -1: one per core, at most 16"
     )
     compile: MayDiffer[bool] = Field(
-        False,
-        description="compile the layers of the language model: faster after some minutes; needs a C compiler",
+        False, description="compile the layers of the language model: faster after some minutes; needs a C compiler"
     )
     report_to: MayDiffer[tuple[str, ...]] = Field(
         (), description="loggers of accelerate that get the curves, such as tensorboard or wandb; empty: none"

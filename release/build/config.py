@@ -32,8 +32,7 @@ class ReleaseConfig(Config):
     )
     num_frames: int = Field(400, ge=1, description="largest number of frames per track; not used with selection all")
     flights: tuple[str, ...] = Field(
-        (),
-        description="patterns of track folders, such as Town01/trajectory_17*/ORI; empty: all",
+        (), description="patterns of track folders, such as Town01/trajectory_17*/ORI; empty: all"
     )
     tracks: Distinct[tuple[TrackName, ...]] = Field(
         ("clean", "perturbed"), min_length=1, description="tracks of a trajectory to release"

@@ -71,10 +71,7 @@ def with_unique_names(sources: list[Source]) -> list[Source]:
     """
     own_names = [source.run for source in sources]
     names = list(own_names)
-    for with_more in (
-        lambda data, run: f"{run}_{data.name}",
-        lambda data, run: f"{data.parents[1].name}_{run}",
-    ):
+    for with_more in (lambda data, run: f"{run}_{data.name}", lambda data, run: f"{data.parents[1].name}_{run}"):
         counts = Counter(names)
         names = [
             folder_name(with_more(source.data.absolute(), run)) if counts[name] > 1 else name
