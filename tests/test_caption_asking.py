@@ -178,7 +178,6 @@ def test_windows_with_recorded_answers_say_nothing_about_the_time_that_is_left()
     totals, shown = Counter[str](), list[str]()
     progress = asking.RunProgress(lambda count, words: shown.append(words), 3, Budget(BudgetConfig(), 1, totals))
     progress.add(None)
-    assert "answers 0 in " in shown[-1]
     assert " left" not in shown[-1]
     totals["answers"] += 1
     progress.add(None)
