@@ -205,7 +205,6 @@ def test_a_trial_shows_questions_answers_and_outcomes_and_keeps_the_answers(tree
         cfg = settings(server.url, endpoint={"json_schema": False})
         text = "\n".join(show_windows(cfg, tree, tmp_path / "prose", 1))
     assert text.count(", no json object) ---") == 3
-    assert "fix: remove caption.endpoint.json_schema=false" in text
     with deciding("ascend", lambda index, body: "wrong_therefore" if index == 0 else None) as server:
         text = "\n".join(show_windows(settings(server.url), tree, tmp_path / "corrected", 1))
     assert text.count("[as in request 1]") == 2  # the system prompt and the flight data, not the complaint
