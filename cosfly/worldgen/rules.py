@@ -9,28 +9,29 @@ Source: an alternative to the language model of app:simworld:step1 where no endp
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
-from cosfly.runtime.config import read_yaml
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.seeding import rng_for
+from cosfly.worldgen.phrases import (
+    ADJECTIVES,
+    NOUNS,
+    ORDINARY,
+    POSITIONS,
+    SETTLEMENT_NOUNS,
+    SETTLEMENTS,
+    STOPS,
+    WORDS,
+    Phrase,
+    holds,
+    longest_first,
+    nearby_noun,
+    noun_before,
+    phrases_of,
+    words_of,
+)  # fmt: skip
 from cosfly.worldgen.plan import LEAST_FOOTPRINT_M, OBJECTS, PATH_M, WorldPlan
 
-
-def _words(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",") if word.strip()]
-
-
-def _longest_first(words: Iterable[str]) -> list[str]:
-    return sorted(words, key=len, reverse=True)  # "office tower" before "tower"
-
-
-WORDS = read_yaml(Path(__file__).with_name("words.yaml"))
-POSITIONS = set(_words(WORDS["positions"]))
-STOPS = set(_words(WORDS["stops"])) | POSITIONS
-ORDINARY = set(_words(WORDS["ordinary"]))
 FIELD_BOUNDS = {
     "gap_m": (0.05, 40.0), "street_m": (5.0, 40.0), "avenue_m": (5.0, 60.0), "parked_share": (0.0, 0.9),
     "blocks_along": (1.0, 9.0), "block_m": (20.0, 180.0),
@@ -71,7 +72,7 @@ _SIZES = {
 }
 _CARS = r"\b\d+ (?:[a-z-]+ )?cars(?: parked)?\b"  # a number, which is not used: "20 parked cars"
 _ABSENT = r"\b(?:no|without(?: any)?)\s+((?:(?! (?:but|and|with) )[^.,;:()])+)"  # "without any towers"
-_STOPS = "|".join(_longest_first(STOPS))
+_STOPS = "|".join(longest_first(STOPS))
 # What can be absent. Nothing is done about other words after "no", such as "no balconies" or "no houses".
 _BUILDINGS = [
     f"{name}, {row['words']}" for name, row in WORDS["buildings"].items() if name not in ("house", "building")
@@ -79,9 +80,9 @@ _BUILDINGS = [
 _CAN_BE_ABSENT = [
     *("high", "tall", "building", "vehicle", "traffic", "tree", "vegetation", "car", "cars"),
     *WORDS["open"], *WORDS["water"], *OBJECTS, *(word for obj in OBJECTS.values() for word in obj.words),
-    *(word for words in _BUILDINGS for word in _words(words)),
+    *(word for words in _BUILDINGS for word in words_of(words)),
 ]  # fmt: skip
-_HAS_EFFECT = re.compile(rf"\b(?:{'|'.join(_longest_first(_CAN_BE_ABSENT))})(?:e?s|er|est)?\b")
+_HAS_EFFECT = re.compile(rf"\b(?:{'|'.join(longest_first(_CAN_BE_ABSENT))})(?:e?s|er|est)?\b")
 
 # Fields that an adjective changes, by target: what its noun stands for.
 FIELDS: dict[str, set[str]] = defaultdict(
@@ -92,86 +93,12 @@ FIELDS: dict[str, set[str]] = defaultdict(
     water={"river_m"},
     other=set(),
 )
+OF_ANY = ("vegetation", "cars")  # groups of adjectives that describe the town, unless a noun follows
 # Widths: target -> field, and the possible range, m.
 WIDTHS = {"street": ("street_m", 5.0, 40.0), "avenue": ("avenue_m", 5.0, 60.0), "water": ("river_m", 4.0, 100.0)}
-OF_ANY = ("vegetation", "cars")  # groups of adjectives that describe the town, unless a noun follows
-ADJECTIVES = {
-    word: (group, choice)
-    for group, rows in WORDS["groups"].items() for choice, row in rows.items() for word in _words(row["words"])
-}  # fmt: skip
-SETTLEMENTS = {name: {*_words(row["words"])} for name, row in WORDS["settlements"].items()}
-SETTLEMENT_NOUNS = {*_words(WORDS["sized"])}.union(*SETTLEMENTS.values())
-# Nouns by target; later ones of a word replace earlier ones.
-NOUNS = {
-    **dict.fromkeys([*ORDINARY, *WORDS["open"], *_words(WORDS["lacking"])], "other"),
-    **dict.fromkeys(WORDS["water"], "water"),
-    **dict.fromkeys(_words(WORDS["streets"]), "street"),
-    **dict.fromkeys(_words(WORDS["avenues"]), "avenue"),
-    **{word: name for name, row in WORDS["buildings"].items() for word in (*_words(row["words"]), name)},
-    **{word: "other" for obj in OBJECTS.values() for word in (obj.name, *obj.words)},
-    **dict.fromkeys(SETTLEMENT_NOUNS, "town"),
-}
-_TOKEN = re.compile(
-    rf"#(?P<measure>\d+)#|(?P<end>[.,;:()]|(?<![\w-])(?:{'|'.join(_words(WORDS['ends']))})(?![\w-]))"
-    rf"|(?<![\w-])(?:(?P<known>{'|'.join(_longest_first([*ADJECTIVES, *NOUNS]))})(?:e?s)?|(?P<word>[\w-]+))(?![\w-])"
-)
 
 
-def _holds(text: str, word: str) -> bool:
-    return re.search(rf"(?<![\w-]){re.escape(word)}s?(?![\w-])", text) is not None
-
-
-class _Phrase:
-    """The adjectives and nouns between two prepositions or punctuation marks."""
-
-    def __init__(self, end: str) -> None:
-        self.ends = [end]  # what is before it
-        self.text = ""
-        self.adjectives = list[tuple[int, str]]()  # with their places in the text
-        self.measures = list[int]()  # their numbers
-        self.nouns = list[str]()
-        self.words = set[str]()  # all others
-
-    @property
-    def head(self) -> str:
-        """The noun that the adjectives describe; empty if the phrase has none, "?" if it has an unknown one."""
-        return self.nouns[-1] if self.nouns else "" if self.words <= STOPS else "?"
-
-
-def _phrases(text: str) -> list[_Phrase]:
-    """Split a text into phrases."""
-    phrases = [_Phrase(".")]
-    for match in _TOKEN.finditer(text):
-        phrase = phrases[-1]
-        phrase.text += " " + (match[0] if not match["end"] else "")
-        if match["measure"]:
-            phrase.measures.append(int(match["measure"]))
-        elif match["end"] and not (phrase.adjectives or phrase.nouns or phrase.words or phrase.measures):
-            phrase.ends.append(match["end"])
-        elif match["end"]:
-            phrases.append(_Phrase(match["end"]))
-        elif match["known"] in ADJECTIVES:
-            phrase.adjectives.append((match.start(), match["known"]))
-        elif match["known"]:
-            phrase.nouns.append(match["known"])
-        else:
-            phrase.words.add(match["word"])
-    return phrases
-
-
-def _nearby_noun(phrases: list[_Phrase], number: int) -> str:
-    """Return the noun for a phrase without one: "a small, dense | town", "houses are low | and narrow"."""
-    for after in phrases[number + 1 : number + 2]:
-        if after.nouns and {",", "and"}.issuperset(after.ends) and not {"a", "an", "the"} & after.words:
-            return after.head
-    return _noun_before(phrases, number)
-
-
-def _noun_before(phrases: list[_Phrase], number: int) -> str:
-    return next((phrase.head for phrase in reversed(phrases[:number]) if phrase.nouns), "")
-
-
-def _noun_of_measure(phrases: list[_Phrase], number: int, name: str, match: re.Match[str]) -> str:
+def _noun_of_measure(phrases: list[Phrase], number: int, name: str, match: re.Match[str]) -> str:
     """Return the noun of a measure in a phrase: of the phrase, or in a phrase without one, the noun before it."""
     phrase = phrases[number]
     if name == "at_most" and match[0].startswith(("no", "none", "nothing")):
@@ -179,7 +106,7 @@ def _noun_of_measure(phrases: list[_Phrase], number: int, name: str, match: re.M
     if phrase.head:
         return phrase.head
     is_of_town = "." in phrase.ends or (name in _SIZES and "of" not in phrase.ends and "each" not in phrase.words)
-    return "" if is_of_town else _noun_before(phrases, number) or _nearby_noun(phrases, number)
+    return "" if is_of_town else noun_before(phrases, number) or nearby_noun(phrases, number)
 
 
 def _target(group: str, noun: str) -> str:
@@ -200,11 +127,11 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
 def _normalized(prompt: str) -> str:
     """Return a prompt in lower case with numbers in digits, and with one word for phrases such as "few trees"."""
     text = prompt.lower().replace("’", "'").replace("#", " ")  # "#" marks measures
-    for words in _longest_first(WORDS["amounts"]):
+    for words in longest_first(WORDS["amounts"]):
         amount = WORDS["amounts"][words]  # "hardly any greenery" becomes the word "few-trees" of the choices
         text = re.sub(rf"\b{words} (?:trees|vegetation|greenery)\b", f"{amount}-trees", text)
         text = re.sub(rf"\b{words} (?:parked )?cars\b", f"{amount}-cars", text)
-    for word in _longest_first(WORDS["numbers"]):
+    for word in longest_first(WORDS["numbers"]):
         text = re.sub(rf"\b{word}\b", str(WORDS["numbers"][word]), text)
     for plain, pattern in (
         # "a church whose tower": a part of it, which is not used
@@ -255,7 +182,7 @@ class _Reader:
     def read(self, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
         """Return the plan and the trace."""
         whole_text = self.text
-        self._take_phrases()
+        self._takephrases_of()
         implied = [WORDS["buildings"][name].get("implies") for name, count in self.buildings.items() if count != 1]
         place = self.named or next(filter(None, implied), "town")
         settlement = WORDS["settlements"][place]
@@ -300,7 +227,7 @@ class _Reader:
     # --- phrases of the text ---
 
     def _has(self, words: str) -> bool:
-        return any(_holds(self.text, word) for word in _words(words))
+        return any(holds(self.text, word) for word in words_of(words))
 
     def _take(self, pattern: str, keep: str = ",") -> re.Match[str] | None:
         """Return the first match of a pattern, and put `keep` in its place."""
@@ -312,7 +239,7 @@ class _Reader:
 
     def _take_words(self, words: str, meaning: str = "") -> None:
         """Take all of some words, singular or plural; meaning: what they were used for, if that is not plain."""
-        for word in _longest_first(_words(words)):
+        for word in longest_first(words_of(words)):
             while match := self._take(rf"(?<![\w-]){re.escape(word)}s?(?![\w-])"):
                 if meaning:
                     self.used[-1] = f"{match[0].strip()} ({meaning})"
@@ -333,7 +260,7 @@ class _Reader:
         self.used.append(f"{match[1] or ''} {match[3]}{meaning}".strip().replace("hotel-building", "hotel"))
         return int(match[1] or 0) or (1 if match[3] == word else plural_count)
 
-    def _take_phrases(self) -> None:
+    def _takephrases_of(self) -> None:
         """Take measures and nouns. Each is taken before those that would misread it."""
         for name, pattern in (_SIZES | _HEIGHTS).items():  # before nouns, which their numbers do not count
             while match := self._take(pattern, keep=f"#{len(self.measures)}#"):
@@ -346,7 +273,7 @@ class _Reader:
                 self.not_used.append(match[0].strip())
         self._attach_words()
         self.objects = self._take_objects()  # before buildings: a clock tower is no tower
-        for word in _words(WORDS["lacking"]):  # before buildings: a control tower is none either
+        for word in words_of(WORDS["lacking"]):  # before buildings: a control tower is none either
             if match := self._take(rf"(?:\b\d+ )?\b{word}s?\b"):
                 self.not_used.append(match[0].strip())
         # The words of settlements and patterns stay in the text until all else is read, because other tables have them
@@ -357,7 +284,7 @@ class _Reader:
         """Take the objects of the table; return their counts."""
         counts: dict[str, int] = {}
         names = {word: obj.name for obj in OBJECTS.values() for word in (obj.name, *obj.words)}
-        for word in _longest_first(names):
+        for word in longest_first(names):
             name = names[word]
             while (count := self._take_counted(word, SEVERAL, name)) is not None:
                 counts[name] = self._within(f"number of {name}s", count, 1, 500)
@@ -365,9 +292,9 @@ class _Reader:
 
     def _take_buildings(self) -> dict[str, int | None]:
         """Take the kinds of buildings; return their counts, None for a plural without a number."""
-        names = {word: name for name, row in WORDS["buildings"].items() for word in [*_words(row["words"]), name]}
+        names = {word: name for name, row in WORDS["buildings"].items() for word in [*words_of(row["words"]), name]}
         counts: dict[str, int | None] = {}
-        for word in _longest_first(names):
+        for word in longest_first(names):
             name = names[word]
             while (count := self._take_counted(word, 0, name, needs_number=name == "building")) is not None:
                 count += counts.get(name) or 0
@@ -376,11 +303,11 @@ class _Reader:
 
     def _attach_words(self) -> None:
         """Find the named settlement, and take the measures and adjectives for what their nouns stand for."""
-        phrases = _phrases(self.text)
+        phrases = phrases_of(self.text)
         # "Winding streets" name a pattern, a round pond does not.
         of_streets = ",".join(phrase.text for phrase in phrases if NOUNS.get(phrase.head, "town") in (*WIDTHS, "town"))
         for name, patterns in WORDS["patterns"].items():
-            is_named = any(_holds(self.text if " " in word else of_streets, word) for word in _words(patterns))
+            is_named = any(holds(self.text if " " in word else of_streets, word) for word in words_of(patterns))
             self.pattern = self.pattern or (name if is_named else None)
         for number, phrase in enumerate(phrases):
             if not self.named and phrase.head in SETTLEMENT_NOUNS:
@@ -391,7 +318,7 @@ class _Reader:
         for number, phrase in enumerate(phrases):
             for start, word in phrase.adjectives:
                 group, choice = ADJECTIVES[word]
-                noun = phrase.head or ("" if group in OF_ANY else _nearby_noun(phrases, number))
+                noun = phrase.head or ("" if group in OF_ANY else nearby_noun(phrases, number))
                 target = _target(group, noun)
                 chosen = self.choices.setdefault(target, {})
                 if FIELDS[target].isdisjoint(WORDS["groups"][group][choice]) or chosen.get(group, choice) != choice:
