@@ -213,7 +213,10 @@ class _Reader:
         for name, (low, high) in FIELD_BOUNDS.items():
             self.plan[name] = min(high, max(low, self.plan[name]))
         self.plan["objects"] = [{"name": name, "count": count} for name, count in self.objects.items()]
-        self.plan["not_used"] = [*dict.fromkeys([*self.not_used, *self._left_over()])]
+        in_the_south = {"south (position)", "southern (position)"} if self.plan["is_shore"] else set()  # as all shores
+        self.plan["not_used"] = [
+            words for words in dict.fromkeys([*self.not_used, *self._left_over()]) if words not in in_the_south
+        ]
         plan = WorldPlan.model_validate(self.plan)
         trace = {
             "planner": "rules", "settlement": place, "settlement_is_named": bool(self.named or any(implied)),
@@ -348,7 +351,7 @@ class _Reader:
             chosen[name] = match
             self.used.append(f"{match[0].strip()} ({'size' if chosen is self.sizes else noun or 'all buildings'})")
         else:
-            self.not_used.append(match[0].strip())
+            self.not_used.append(match[0].strip() + (f" (of {noun})" if noun in NOUNS else ""))
 
     def _take_open_and_water(self) -> bool:
         """Take words of open blocks and of water, and set both; return whether open blocks are named."""
@@ -507,7 +510,7 @@ def _range_of(limits: dict[str, re.Match[str]]) -> tuple[float, float | None]:
         if name == "between":
             low_m = float(match["low"]) * unit_m
         elif name == "exactly":
-            low_m = height_m - 0.9 * unit_m  # less than a storey lower, so that their number is the same
+            low_m = height_m
     return low_m, high_m
 
 

@@ -228,8 +228,10 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
     files = ("trace.json", "plan.yaml", "layout.json", "placement.json", WORLD_FILE, SIZES_FILE, "checks.json")
     outputs = [out / name for name in (*files, "map.png", LOOP_FILE)]
     stage.finish(outputs, tally, num_boxes=len(town.boxes), is_valid=all(check["is_met"] for check in checks))
+    log.info("the town from above: %s", out / "map.png")
     log.info("to change the town, edit a copy of %s, then: cosfly world COPY --out NEW", out / "plan.yaml")
-    log.info("make a data set of it with: cosfly run %s --out %s", out / LOOP_FILE, out / "run")
+    few = "--set pedestrians.num_paths=2"  # 20 take ten times as long
+    log.info("make a small data set of it with: cosfly run %s %s --out %s", out / LOOP_FILE, few, out / "run")
     return product
 
 
