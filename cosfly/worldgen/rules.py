@@ -182,7 +182,7 @@ class _Reader:
     def read(self, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
         """Return the plan and the trace."""
         whole_text = self.text
-        self._takephrases_of()
+        self._take_phrases()
         implied = [WORDS["buildings"][name].get("implies") for name, count in self.buildings.items() if count != 1]
         place = self.named or next(filter(None, implied), "town")
         settlement = WORDS["settlements"][place]
@@ -263,7 +263,7 @@ class _Reader:
         self.used.append(f"{match[1] or ''} {match[3]}{meaning}".strip().replace("hotel-building", "hotel"))
         return int(match[1] or 0) or (1 if match[3] == word else plural_count)
 
-    def _takephrases_of(self) -> None:
+    def _take_phrases(self) -> None:
         """Take measures and nouns. Each is taken before those that would misread it."""
         for name, pattern in (_SIZES | _HEIGHTS).items():  # before nouns, which their numbers do not count
             while match := self._take(pattern, keep=f"#{len(self.measures)}#"):
@@ -374,7 +374,7 @@ class _Reader:
         has_open = bool(named)
         if has_open:  # what the settlement has without being asked
             self.plan |= dict.fromkeys({"plazas", "greens"} - named, 0)
-        self._take_words(",".join(WORDS["rivers"].split(",")))
+        self._take_words(WORDS["rivers"])
         self._take_words(",".join(WORDS["water"]), "shore")
         num_bridges = self.objects.get("bridge", 0) + self.objects.get("footbridge", 0)
         if re.search(r"\bbridges?\b", self.absent):
@@ -420,7 +420,7 @@ class _Reader:
     def _set_buildings(self, has_open: bool) -> None:
         """Set the kinds of buildings, and whether there are no others."""
         counts = [count for count in self.buildings.values() if count is not None]
-        is_of_them = any(f" of {count} " in self.normalized for count in counts)
+        is_of_them = any(re.search(rf" of {count} (?!m\b|met|floor|stor|level)", self.normalized) for count in counts)
         for name, count in self.buildings.items():
             row = WORDS["buildings"][name]
             footprint_m = row.get("footprint_m", self.plan["footprint_m"])
@@ -459,7 +459,7 @@ class _Reader:
         """Set the widths of streets and of the water to those of the prompt."""
         for target, (field, low_m, high_m) in WIDTHS.items():
             for name, match in self.limits.get(target, {}).items():
-                width_m = float(match["number"])
+                width_m = float(match["number"]) * (_metres(match[2]) if name == "width" else 1.0)
                 if name == "between":
                     width_m = (float(match["low"]) + width_m) / 2
                 if name == "at_least":

@@ -204,7 +204,7 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0) -> Path:
         fix = (
             f"make the town larger, or its blocks and streets smaller, in the text or in a copy of {out / 'plan.yaml'}"
         )
-        raise InputError(what, where="PROMPT", got=f"{size}, blocks of {plan.block_m:.0f} m", fix=fix)
+        raise InputError(what, where=cfg.plan or "PROMPT", got=f"{size}, blocks of {plan.block_m:.0f} m", fix=fix)
     _write_world(town, out)
     checks = check_world(town, plan)
     not_respected = _not_respected(checks, town, trace)
