@@ -408,7 +408,6 @@ def test_a_slow_answer_to_the_largest_prompt_is_no_matter_of_the_context():
     findings = examine(respond, image={"modalities": []}, endpoint={"timeout_s": IMPATIENT["timeout_s"]})
     assert list(findings) == ["model", "answers", "thinking", "JSON schema", "speed"]
     assert findings["speed"].state == "unusable"
-    # On a busy machine the answer before is slow, too, so that the prompt is not suspected.
     words = (
         r"an answer of 1024 tokens takes \d+ s(, so it is probably the prompt .*)?; set caption.endpoint.timeout_s=\d+,"
     )

@@ -92,7 +92,7 @@ def test_a_refused_slot_names_the_fault_and_the_fix():
         assert found.reason == "invalid_slot"
         assert words in found.complaint
     sentence = read_sentence("The turn to the {side:decision} has to go on.", "en", len(FACTS))
-    with pytest.raises(InvalidSlot, match="'go on': the turn is to the right here"):
+    with pytest.raises(InvalidSlot, match="has to go on': the turn is to the right here"):
         Filler(FACTS, "yaw_left_to_follow", "en").fill(sentence)
 
 

@@ -194,6 +194,7 @@ def test_a_hopeless_teacher_is_stopped_and_its_commonest_reasons_are_explained(t
     with deciding("ascend", lambda number, body: "short") as server:
         with pytest.raises(TeacherError, match=told):
             run(settings(server.url, **cfg), tree, tmp_path / "out")
+        assert report_of(tmp_path / "out")["windows"]["input"] >= 3  # also the last one
         with pytest.raises(NothingKept):
             run(settings(server.url, **cfg | {"stop_after_dropped": 0}), tree, tmp_path / "out")
     assert report_of(tmp_path / "out")["windows"]["input"] > 3

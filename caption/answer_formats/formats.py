@@ -161,8 +161,10 @@ _NEITHER = ("straight", "centred")  # words of a side that say neither side
 # A side of these is a reason to turn to it; when the drone itself moves to the left, it may have to turn to the right.
 # With a first frame it may be a side of an earlier time.
 _TURN_REASONS = [(name, "side", None) for name in ("yaw", "offset_x", "bearing", "target_sideways_speed")]
-STEADY_DPS = 0.5  # slower turns are none
-_LINE_OF_SIGHT, _GOES_ON = re.compile("line of sight|视线|连线"), re.compile("go on|continu|keep turning|继续向")
+STEADY = 0.5  # smaller turns, deg or deg/s, are none; both are compared, because a track may jitter
+# What a sentence says of the side of the decision: that the line of sight, or the drone, turns to it.
+_SIGHT_TURNS = re.compile(r"line of sight(?: to \w+ \w+)?(?: (?:has|is|keeps|clearly))* turn|[视连]线\w{0,6}向%s")
+_TURN_GOES_ON = re.compile(r"turn\b.* has to go on|继续向%s转")
 _VOWEL = re.compile(r"[aeio]|8|1[18]\b")  # what begins with a vowel when it is spoken: eight, eleven, eighteen
 
 
@@ -182,11 +184,9 @@ class Filler:
     def _check_reason(self, sentence: Sentence) -> None:
         """Raise InvalidSlot if a sentence gives a fact or a turn to one side as the reason for a turn to the other."""
         other, sign = ("left", -1) if "right" in self.decision else ("right", 1)
-        turn_dps = max(
-            sign * self.facts.yaw_deg[-1], sign * (self.facts.yaw_rate_dps[-1] or 0.0)
-        )  # surely to the other
-        for words, moved in ((_LINE_OF_SIGHT, sign * self.facts.sight_rate_dps), (_GOES_ON, turn_dps)):
-            if moved < -STEADY_DPS and (match := words.search(sentence.pattern)):
+        turn = max(sign * self.facts.yaw_deg[-1], sign * (self.facts.yaw_rate_dps[-1] or 0.0))
+        for words, moved in ((_SIGHT_TURNS, sign * self.facts.sight_rate_dps), (_TURN_GOES_ON, turn)):
+            if moved < -STEADY and (match := words.search(sentence.pattern)):
                 raise InvalidSlot(f"{match[0]!r}: the turn is to the {other} here, no reason for {self.decision}")
         for slot in sentence.slots:
             if slot.reference and slot.reference[:3] in _TURN_REASONS:

@@ -78,7 +78,7 @@ def find_inputs(cfg: CaptionConfig, data: Path) -> tuple[list[TrackInput], bool]
     ids = flight_ids([place_of(folder) for folder in folders])
     tracks = [TrackInput(ids[place_of(folder)], folder) for folder in folders]
     tracks.sort(key=lambda track: f"{track.name}_frame_")  # the order of the sample ids
-    counts = [track.guess_num_windows(cfg.window) for track in tracks]
+    counts = [track.guess_num_windows(cfg.window) for track in tracks] if cfg.limit else []
     if cfg.limit is None or cfg.limit >= sum(counts):
         return tracks, False
     numbers, inputs, begin = spread(sum(counts), cfg.limit), [], 0
